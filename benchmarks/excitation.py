@@ -23,6 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 # ruff: noqa: E402  (what is imported lies in a folder that is no package)
+from droid_jax import runtime
+
+runtime.tune()
 # isort: split
 
 import mujoco
@@ -31,7 +34,6 @@ import tyro
 
 from benchmarks.check_cases import JOINTS, KP, RATE, measured, played, real, two_link
 from benchmarks.common import publish
-from droid_jax import runtime
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.additions import Proposal, propose
 from droid_jax.identify.excitation import Excitation, ExcitationConfig, excitation
@@ -118,7 +120,7 @@ def motion(kind: str) -> tuple[np.ndarray, np.ndarray]:
 def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.ndarray, seed: int) -> Recording:
     """Two repeats without torques are few: one repeat of torques and positions, with noise."""
     channels = measured(time, *played(model, command, command[0]), 1, np.random.default_rng(seed))
-    start = dict(zip(JOINTS, command[0].tolist(), strict=True))
+    start: dict[str, float] = {str(j): float(q) for j, q in zip(JOINTS, command[0], strict=True)}
     return Recording(
         name, time, command, JOINTS, channels, TorqueConvention(TorqueSide.MOTOR, gravity=True), qpos0=start,
         gains=ServoGains(KP, np.zeros(2)),
@@ -199,7 +201,6 @@ def main(command: Compared) -> dict[str, Any]:
 
 if __name__ == "__main__":
     given = tyro.cli(Compared, description=__doc__)
-    runtime.start()
     outcome = main(given)
     line = {key: value for key, value in outcome.items() if not isinstance(value, (list, dict))}
     publish(given.out, "excitation", given.quick, given.seed, outcome, line)

@@ -43,7 +43,11 @@ class CheckCommand:
 
 def run(command: CheckCommand) -> None:
     """Print the tables, and write page and JSON."""
+    from droid_jax import runtime
     from droid_jax.commands.options import recording_at
+
+    if command.parameters is not None and command.scene is not None:
+        runtime.start()  # before what is imported below starts jax
     from droid_jax.model.scene import load_scene
     from droid_jax.preflight.inspect_log import contents, inspect_log
     from droid_jax.report.check_page import check_page
@@ -90,9 +94,6 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
     """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
     if command.parameters is None or command.scene is None:
         return None
-    from droid_jax import runtime
-
-    runtime.start()
     from droid_jax.identify.additions import propose
     from droid_jax.identify.excitation import excitation
     from droid_jax.model.parameter_file import friction_joints, load_parameters

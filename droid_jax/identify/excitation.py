@@ -1,6 +1,6 @@
 """Which parameters a motion can tell, before any fit: from the sensitivity of its replay.
 
-The replay is differentiated at the initial means and, since these may be far from the robot, again where one or two
+The replay is differentiated at the initial means and, since these may be far from the robot, again where a few
 Gauss-Newton steps from there lead.  What the replay leaves there and its slopes are then judged by the rules of a fit:
 the width of its Gaussian (`posterior`), and when a parameter is identifiable.
 Source: Gautier and Khalil, Exciting trajectories for the identification of base inertial parameters, IJRR 1992.
@@ -40,7 +40,8 @@ class ExcitationConfig:
 
     seconds: of each recording that are replayed; what a longer one tells is taken to grow with its length.
     step: half-width of the differences, search units.
-    steps: Gauss-Newton steps from the initial means at most.
+    steps: Gauss-Newton steps from the initial means at most; they end where
+    worth: one lowers the mean square of the residuals by no more than this share.
     longest_step: of each of their components, search units.
     compare: how simulation and measurement are compared.
     identifiability: when a parameter counts as identifiable.
@@ -48,7 +49,8 @@ class ExcitationConfig:
 
     seconds: float = 20.0
     step: float = 0.1
-    steps: int = 2
+    steps: int = 6
+    worth: float = 0.02
     longest_step: float = 1.5
     compare: CompareConfig = field(default_factory=CompareConfig)
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
@@ -57,6 +59,7 @@ class ExcitationConfig:
         check_fields(
             self,
             **dict.fromkeys(("seconds", "step", "longest_step"), partial(number, above=0)),
+            worth=partial(number, least=0, below=1),
             steps=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
@@ -177,7 +180,7 @@ def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refined, Cost]:
-    """Where one or two Gauss-Newton steps lead, and the cost with its noise stated from there."""
+    """Where a few Gauss-Newton steps lead, and the cost with its noise stated from there."""
     x, best = space.to_search(space.mean), np.inf
     prior = np.where(space.nuisance, 1.0, LevenbergMarquardtConfig().main_prior)
     kept: tuple[Refined, Cost] | None = None
@@ -188,8 +191,10 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
             if kept is None:
                 raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
             break
-        if kept is not None and not float(np.mean(kept[1].whitened_of(rollouts)[0] ** 2)) < best:
+        reached = np.inf if kept is None else float(np.mean(kept[1].whitened_of(rollouts)[0] ** 2))
+        if kept is not None and not reached < best:
             break
+        enough = kept is not None and reached > (1 - config.worth) * best
         stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
         now = cost.compared_by(stated)
         residuals = now.whitened_of(rollouts)
@@ -202,6 +207,8 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
             converged=False,
         )  # fmt: skip
         kept = refined, now
+        if enough:
+            break
         pull = np.linalg.solve(refined.hessian, jacobian.T @ residuals[0] + x / prior**2)
         size = max(1.0, float(np.abs(pull).max(initial=0.0)) / config.longest_step)
         x = np.clip(x - pull / size, space.to_search(space.low), space.to_search(space.high))
