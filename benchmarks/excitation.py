@@ -35,7 +35,7 @@ import tyro
 from benchmarks.check_cases import JOINTS, KP, RATE, measured, played, real, two_link
 from benchmarks.common import publish
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.identify.additions import Proposal, propose
+from droid_jax.identify.additions import MotionProposal, propose
 from droid_jax.identify.excitation import Excitation, ExcitationConfig, excitation
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
@@ -144,7 +144,7 @@ def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
     log = recorded("poor", model, *motion(kind), seed)
     found = excitation(scene, space, [log])
     began = time.monotonic()
-    proposal: Proposal = propose(scene, space, found, log)
+    proposal: MotionProposal = propose(scene, space, found, log)
     seconds = found.seconds + time.monotonic() - began
     fit = identifiable(scene, space, [log])
     row: dict[str, Any] = {"motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from droid_jax.identify.additions import Proposal
+    from droid_jax.identify.additions import MotionProposal
     from droid_jax.identify.excitation import Excitation
     from droid_jax.preflight.findings import Finding
     from droid_jax.preflight.inspect_log import Signal
@@ -90,7 +90,7 @@ def run(command: CheckCommand) -> None:
     print(f"page: {command.out / 'check.html'}")
 
 
-def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple[Excitation, Proposal] | None:
+def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple[Excitation, MotionProposal] | None:
     """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
     if command.parameters is None or command.scene is None:
         return None
@@ -109,7 +109,7 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
     return found, propose(scene, space, found, recordings[0])
 
 
-def _show_told(found: Excitation, proposal: Proposal) -> None:
+def _show_told(found: Excitation, proposal: MotionProposal) -> None:
     """The table of parameters on the terminal, and the sentence below it."""
     from rich.console import Console
     from rich.table import Table
@@ -127,7 +127,7 @@ def _show_told(found: Excitation, proposal: Proposal) -> None:
     console.print(Text(proposal.sentence))
 
 
-def _csv(proposal: Proposal) -> bytes:
+def _csv(proposal: MotionProposal) -> bytes:
     """The commands of a proposal: time, s, and the joints, rad or m."""
     time, rows = proposal.commands()
     lines = [",".join(("time", *proposal.joints))]
@@ -167,7 +167,7 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
 def _json(
     command: CheckCommand,
     checked: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
-    told: tuple[Excitation, Proposal] | None,
+    told: tuple[Excitation, MotionProposal] | None,
 ) -> bytes:
     """The content of check.json."""
     import json

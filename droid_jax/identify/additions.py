@@ -48,7 +48,7 @@ class Addition:
 
 
 @dataclass(frozen=True, eq=False)
-class Proposal:
+class MotionProposal:
     """What to record besides.
 
     chosen: in the order in which they were picked.  told: of each parameter with them.  opened: the names that they
@@ -129,7 +129,7 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
 
 def propose(
     scene: Scene, space: Space, found: Excitation, recording: Recording, candidates: Sequence[Addition] | None = None
-) -> Proposal:
+) -> MotionProposal:
     """The shortest addition, of those of `additions`, that tells what a recording leaves open.
 
     Args:
@@ -171,7 +171,7 @@ def propose(
             total = rest
     after = told(total)
     now = {t.name for t in after if t.identifiable}
-    return Proposal(
+    return MotionProposal(
         chosen=tuple(chosen),
         told=after,
         opened=tuple(name for name in found.open if name in now),
@@ -185,7 +185,7 @@ def _information(
     scene: Scene, space: Space, found: Excitation, recording: Recording, candidates: Sequence[Addition]
 ) -> dict[int, np.ndarray]:
     """Number of an addition -> [D, D] information, per squared search unit."""
-    motions = [as_recording(scene, recording, addition, str(k)) for k, addition in enumerate(candidates)]
+    motions = [motion_recording(scene, recording, addition, str(k)) for k, addition in enumerate(candidates)]
     config = found.config
     with silent():
         cost = make_cost(scene, space, motions, engine=found.engine, config=config.compare, check=False)
@@ -206,7 +206,7 @@ def _information(
     return out
 
 
-def as_recording(scene: Scene, recording: Recording, addition: Addition, name: str) -> Recording:
+def motion_recording(scene: Scene, recording: Recording, addition: Addition, name: str) -> Recording:
     """An addition as a recording of one repeat, whose measurements are made up: only its replay is looked at."""
     joints, start = _start(scene, recording)
     table = np.tile(start, (len(addition.time), 1))

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from droid_jax.identify.additions import Proposal
+from droid_jax.identify.additions import MotionProposal
 from droid_jax.identify.excitation import Excitation
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.inspect_log import Signal
@@ -35,7 +35,7 @@ MOST = 12  # joints that are drawn
 def check_page(
     recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
     scene: str | None,
-    told: tuple[Excitation, Proposal] | None = None,
+    told: tuple[Excitation, MotionProposal] | None = None,
 ) -> str:
     """HTML of recordings with what they hold and what was found in them.
 
