@@ -1,8 +1,8 @@
 """Which parameters a motion can tell, before any fit: from the sensitivity of its replay.
 
 The replay is differentiated at the initial means and, since these may be far from the robot, again where a few
-Gauss-Newton steps from there lead.  What the replay leaves there and its slopes are then judged by the rules of a fit:
-the width of its Gaussian (`posterior`), and when a parameter is identifiable.
+Levenberg-Marquardt steps from there lead.  What the replay leaves there and its slopes are then judged by the rules of
+a fit: the width of its Gaussian (`posterior`), and when a parameter is identifiable.
 Source: Gautier and Khalil, Exciting trajectories for the identification of base inertial parameters, IJRR 1992.
 """
 
@@ -25,13 +25,16 @@ from droid_jax.cost.residuals import CompareConfig, Comparison
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.holdout import beginning
 from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability, posterior
-from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig
+from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, curvature
 from droid_jax.identify.multistart import Refined
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_not_in_c
+
+DAMPINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1000.0)  # of the trial steps, as shares of the curvature
+LENGTHS = (1.0, 0.5, 0.2)  # shares of a whole step: with the dampings one block of a CPU
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,8 @@ class ExcitationConfig:
 
     seconds: of each recording that are replayed; what a longer one tells is taken to grow with its length.
     step: half-width of the differences, search units.
-    steps: Gauss-Newton steps from the initial means at most; they end where
-    worth: one lowers the mean square of the residuals by no more than this share.
+    steps: Levenberg-Marquardt steps from the initial means at most; they end where
+    worth: one lowers the objective by no more than this share.
     longest_step: of each of their components, search units.
     compare: how simulation and measurement are compared.
     identifiability: when a parameter counts as identifiable.
@@ -49,9 +52,9 @@ class ExcitationConfig:
 
     seconds: float = 20.0
     step: float = 0.1
-    steps: int = 6
-    worth: float = 0.02
-    longest_step: float = 1.5
+    steps: int = 12
+    worth: float = 0.05
+    longest_step: float = 2.0
     compare: CompareConfig = field(default_factory=CompareConfig)
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
 
@@ -180,40 +183,60 @@ def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refined, Cost]:
-    """Where a few Gauss-Newton steps lead, and the cost with its noise stated from there."""
-    x, best = space.to_search(space.mean), np.inf
-    prior = np.where(space.nuisance, 1.0, LevenbergMarquardtConfig().main_prior)
-    kept: tuple[Refined, Cost] | None = None
-    for count in range(config.steps + 1):
+    """Where a few Levenberg-Marquardt steps lead from the means, and the cost with its noise stated from there.
+
+    The steps are taken in the noise that is known before a fit; what they leave then tells the noise of one repeat.
+    """
+    x, prior = space.to_search(space.mean), np.where(space.nuisance, 1.0, LevenbergMarquardtConfig().main_prior)
+    low, high = space.to_search(space.low), space.to_search(space.high)
+    count = 0
+    while True:
         rollouts, steps = slopes(cost, space, x, config.step)
         first = [jax.tree.map(lambda a: a[0], rollout) for rollout in rollouts]
         if not all(bool(np.all(rollout.finite)) for rollout in first):
-            if kept is None:
-                raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
-            break
-        reached = np.inf if kept is None else float(np.mean(kept[1].whitened_of(rollouts)[0] ** 2))
-        if kept is not None and not reached < best:
-            break
-        enough = kept is not None and reached > (1 - config.worth) * best
-        stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
-        now = cost.compared_by(stated)
-        residuals = now.whitened_of(rollouts)
-        best = float(np.mean(residuals[0] ** 2))
+            raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
+        residuals = cost.whitened_of(rollouts)
+        now = _objective(residuals[:1], x[None], prior)[0]
         jacobian = jacobian_of(residuals, steps)
-        objective = 0.5 * float(np.sum(residuals[0] ** 2) + np.sum((x / prior) ** 2))
-        refined = Refined(
-            space=space, x=x, best=space.from_search(x), objective=objective, residual=residuals[0], jacobian=jacobian,
-            prior=prior, starts=np.array([objective]), evaluations=(count + 1) * (len(x) + 1), iterations=count,
-            converged=False,
-        )  # fmt: skip
-        kept = refined, now
-        if enough:
+        slope = jacobian.T @ residuals[0] + x / prior**2
+        free = ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))  # of bounds that a step would cross
+        trials = np.clip(x + _trials(jacobian, slope, free, prior, config), low, high)
+        if count == config.steps:
             break
-        pull = np.linalg.solve(refined.hessian, jacobian.T @ residuals[0] + x / prior**2)
-        size = max(1.0, float(np.abs(pull).max(initial=0.0)) / config.longest_step)
-        x = np.clip(x - pull / size, space.to_search(space.low), space.to_search(space.high))
-    assert kept is not None
-    return kept
+        reached = _objective(cost.whitened(space.from_search(trials)), trials, prior)
+        if not np.min(reached) < (1 - config.worth) * now:
+            break
+        x, count = trials[int(np.argmin(reached))], count + 1
+    stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
+    cost = cost.compared_by(stated)
+    residuals = cost.whitened_of(rollouts)
+    objective = float(_objective(residuals[:1], x[None], prior)[0])
+    refined = Refined(
+        space=space, x=x, best=space.from_search(x), objective=objective, residual=residuals[0],
+        jacobian=jacobian_of(residuals, steps), prior=prior, starts=np.array([objective]),
+        evaluations=(count + 1) * (len(x) + 1), iterations=count, converged=False,
+    )  # fmt: skip
+    return refined, cost
+
+
+def _objective(residuals: np.ndarray, x: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """[P] of rows [P, M] at search coordinates [P, D]; infinite where a replay failed."""
+    value = 0.5 * np.sum(np.asarray(residuals, np.float64) ** 2, axis=1) + 0.5 * np.sum((x / prior) ** 2, axis=1)
+    return np.where(np.isfinite(value), value, np.inf)
+
+
+def _trials(
+    jacobian: np.ndarray, slope: np.ndarray, free: np.ndarray, prior: np.ndarray, config: ExcitationConfig
+) -> np.ndarray:
+    """[P, D] steps of the parameters that are free [D], more or less damped, long and short."""
+    hessian = curvature(jacobian, prior)
+    found = list[np.ndarray]()
+    for damping in DAMPINGS:
+        damped, step = hessian + damping * np.diag(np.diag(hessian)), np.zeros(len(slope))
+        step[free] = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
+        step *= min(1.0, config.longest_step / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+        found += [length * step for length in LENGTHS]
+    return np.array(found)
 
 
 def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict[str, float]]:
