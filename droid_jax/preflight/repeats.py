@@ -15,6 +15,7 @@ LEVELS = 8  # a column that moves and takes no more different values is coarse
 RESTS = {"position": 0.02, "velocity": 0.1, "torque": 0.2}  # rad, rad/s, N m: a column that changes by less may rest
 SENT = 1e-4  # of a command's own unit: one that changes by less is constant
 STANDS = {"rad": 5e-3, "m": 5e-4}  # a column that was measured to move by less rests, but for its encoder's steps
+SHORT = 40  # rows below which a recording is not called motionless
 STRAYS = 0.01  # share of the samples at both ends that may be outliers
 NAMED = 3  # pairs of copies that are named
 
@@ -29,7 +30,8 @@ def check_repeats(recording: Recording) -> list[Finding]:
 
 def _motionless(recording: Recording, where: str) -> list[Finding]:
     """A recording in which no command changes and no joint moves."""
-    if recording.command.size and np.ptp(recording.command, axis=0).max() > SENT:
+    rows = max(len(recording.time), *(len(c.time) for c in recording.channels.values()))
+    if rows < SHORT or (recording.command.size and np.ptp(recording.command, axis=0).max() > SENT):
         return []
     most = 0.0
     for channel in (recording.channels[key] for key in ("position", "object_angle") if key in recording.channels):
