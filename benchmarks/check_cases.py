@@ -134,7 +134,9 @@ def synthetic(seed: int, scene: Scene) -> Case:
 
 
 def real(folder: Path) -> Iterator[Case]:
-    """The public logs in a folder: so101, bam_xl330, go2_leg, franka_gaz2019, emps, as far as they are there."""
+    """The public logs in a folder, as far as they are there: so101, bam_xl330, go2_leg, franka_gaz2019, emps,
+    door_pr2_ikea.
+    """
     rad = Units(angle="rad", torque="N m", time="s")
     so101 = folder / "so101"
     if so101.is_dir():
@@ -181,6 +183,16 @@ def real(folder: Path) -> Iterator[Case]:
             f"emps/{path.stem}", load_scene(ROOT / "experiments" / "emps.xml", joints=["slide"]), _read(path, columns)
         )
 
+    for path in sorted((folder / "door_pr2_ikea").glob("*.npz")):
+        with np.load(path) as file:
+            radius = float(file["radius_fit"])
+        columns = ColumnMap(
+            joints=["hinge"], time="t_reconstructed", position="angle_fit", side="motor", gravity=True,
+            torque=ChannelMap("ftan_ati_fit", unit="N m", scale=-radius), units=rad,
+        )  # fmt: skip
+        scene = load_scene(ROOT / "experiments" / "cabinet.xml", joints=["hinge"], object_joint="hinge")
+        yield Case(f"door/{path.stem}", scene, _read(path, columns))
+
 
 def _read(path: Path, columns: ColumnMap) -> Recording:
     return read_log([path], columns)[0]
@@ -202,12 +214,12 @@ class Error:
     words: tuple[str, ...]
     applies: Callable[[Case], bool]
     put: Callable[[Recording], Recording]
-    scene: Callable[[Scene], Scene] = lambda scene: scene
+    scene: Callable[[Case], Scene] = lambda case: case.scene
 
 
-def stronger(scene: Scene) -> Scene:
+def stronger(case: Case) -> Scene:
     """The scene with ten times its servos' gains."""
-    spec = scene.spec.copy()
+    scene, spec = case.scene, case.scene.spec.copy()
     for actuator in spec.actuators:
         actuator.gainprm[0] *= 10.0
         actuator.biasprm[1] *= 10.0
@@ -291,6 +303,10 @@ def _heavy(c: Case) -> bool:
     return _torque(c) and bool(np.any(c.scene.model.opt.gravity))
 
 
+def _command_in_rad(c: Case) -> bool:
+    return _command(c) and c.recording.channels["position"].unit == "rad"
+
+
 def _in_other_units(r: Recording) -> Callable[[np.ndarray], np.ndarray]:
     """Degrees, or millimetres of slides."""
     return np.rad2deg if r.channels["position"].unit == "rad" else lambda v: 1e3 * v
@@ -305,6 +321,123 @@ def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recor
     if name == "command":
         return lambda r: replace(r, command=change(r.command))
     return lambda r: _channel(r, name, change)
+
+
+def _whole(r: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """All clocks."""
+    channels = {key: replace(c, time=change(c.time)) for key, c in r.channels.items()}
+    return replace(r, time=change(r.time), channels=channels)
+
+
+def _span(r: Recording) -> float:
+    values = r.channels["position"].values[r.channels["position"].mask]
+    return float(np.abs(values).max())
+
+
+def _register(values: np.ndarray) -> np.ndarray:
+    """Per mille of the largest torque, of the other sign."""
+    return -np.round(1000.0 * values / np.nanmax(np.abs(values)))
+
+
+def _per_cent(values: np.ndarray) -> np.ndarray:
+    """Of what each joint's drive can do, a fifth more than its largest torque here."""
+    return 100.0 * values / (1.2 * np.nanmax(np.abs(values), axis=(0, 1)))
+
+
+def _standing(r: Recording) -> Recording:
+    """The first instant, throughout; its noise stays."""
+
+    def stopped(values: np.ndarray) -> np.ndarray:
+        return values[:, :1] + 1e-4 * np.sin(7.0 * np.arange(values.shape[1]))[None, :, None]
+
+    still = replace(r, channels={k: replace(c, values=stopped(c.values)) for k, c in r.channels.items()})
+    return replace(still, command=np.tile(r.command[:1], (len(r.command), 1))) if r.command.size else still
+
+
+def _fastest(r: Recording) -> float:
+    """s, where a position's mean changes most quickly, not near the ends."""
+    c = r.channels["position"]
+    speed = np.abs(np.gradient(np.where(c.mask, c.values, 0.0).mean(axis=0), c.time, axis=0)).max(axis=1)
+    inner = slice(len(speed) // 5, len(speed) // 2)
+    return float(c.time[inner][np.argmax(speed[inner])])
+
+
+def _cut(r: Recording) -> Recording:
+    return r.window(_fastest(r), r.span[1])
+
+
+def _limited(share: float, torque: bool) -> Callable[[Case], Scene]:
+    """A scene whose actuators do a share of what the log has; torque: of its torques, else of its commands."""
+
+    def limit(case: Case) -> Scene:
+        spec, recording = case.scene.spec.copy(), case.recording
+        for actuator in spec.actuators:
+            joint = actuator.target
+            if torque:
+                c = recording.channels["torque"]
+                most = share * float(np.abs(c.values[..., c.columns.index(joint)]).max())
+                actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-most, most]
+            elif joint in recording.command_names:
+                path = recording.command[:, recording.command_names.index(joint)]
+                middle, half = (path.max() + path.min()) / 2, share * np.ptp(path) / 2 + 1e-3
+                actuator.ctrllimited, actuator.ctrlrange = (
+                    mujoco.mjtLimited.mjLIMITED_TRUE,
+                    [middle - half, middle + half],
+                )
+        return compile_scene(spec, case.scene.name, joints=case.scene.joints)
+
+    return limit
+
+
+def _floating(case: Case) -> Scene:
+    """The robot on a base that nothing holds."""
+    base = '<body name="loose_base"><freejoint/><inertial pos="0 0 0" mass="5" diaginertia="0.1 0.1 0.1"/>'
+    before, _, after = case.scene.spec.to_xml().partition("<worldbody>")
+    xml = f"{before}<worldbody>{base}{after}".replace("</worldbody>", "</body></worldbody>")
+    return _scene(xml, case.scene.name, case.scene.joints)
+
+
+def _without_files(c: Case) -> bool:
+    return c.name.startswith(("synthetic", "xl330", "go2"))
+
+
+def _silent(r: Recording) -> Recording:
+    """Nothing measured for a tenth of a second in the middle."""
+
+    def cut(time: np.ndarray) -> np.ndarray:
+        middle = (time[0] + time[-1]) / 2
+        return np.abs(time - middle) > max(0.05, 4.0 * float(np.median(np.diff(time))))
+
+    channels = {}
+    for key, c in r.channels.items():
+        keep = cut(c.time)
+        channels[key] = replace(c, time=c.time[keep], values=c.values[:, keep], mask=c.mask[:, keep])
+    return replace(r, channels=channels)
+
+
+def _apart(r: Recording) -> Recording:
+    """Two repeats, the second one 30 mrad (mm) elsewhere, with noise of its own."""
+    twice = r.repeats_subset([0, 0])
+    offset = np.array([0.0, 0.03])[:, None, None]
+    ripple = 1e-3 * np.random.default_rng(0).normal(size=twice.channels["position"].values.shape)
+    return _channel(twice, "position", lambda v: v + offset + ripple)
+
+
+def _turned_round(values: np.ndarray) -> np.ndarray:
+    """Every joint's column under the next one's name."""
+    return np.roll(values, 1, axis=-1)
+
+
+def _three_commands(c: Case) -> bool:
+    return _command(c) and len(c.recording.command_names) > 2
+
+
+def _three_torques(c: Case) -> bool:
+    return _torque(c) and len(c.recording.channels["torque"].columns) > 2
+
+
+def _turns(c: Case) -> bool:
+    return c.recording.channels["position"].unit == "rad"
 
 
 ERRORS = (
@@ -328,4 +461,40 @@ ERRORS = (
     Error("copies of a repeat", ("repeats",), ("identical",), _always, lambda r: r.repeats_subset([0, 0])),
     Error("dead position", ("sensor",), ("dead", "does not move"), _always, of("position", _first_dead)),
     Error("gains of another robot", ("gains", "units"), ("gains",), _command, lambda r: r, stronger),
+    Error("degrees in commands alone", ("units", "range"), ("degrees",), _command_in_rad, of("command", np.rad2deg)),
+    Error(
+        "normalised positions",
+        ("units", "range"),
+        ("normalised",),
+        _turns,
+        lambda r: _positions(r, lambda v: 100.0 * v / _span(r)),
+    ),
+    Error(
+        "encoder counts",
+        ("units", "range"),
+        ("counts", "degrees"),
+        _turns,
+        lambda r: _positions(r, lambda v: np.round(4096.0 * v / (2 * np.pi))),
+    ),
+    Error("milliseconds", ("clock",), ("millisecond",), _always, lambda r: _whole(r, lambda t: 1e3 * t)),
+    Error("load register", ("sign", "units"), ("load register",), _torque, of("torque", _register)),
+    Error("per cent", ("units",), ("per cent",), _torque, of("torque", _per_cent)),
+    Error("dead torque", ("sensor",), ("dead", "does not move"), _several_torques, of("torque", _first_dead)),
+    Error("rotated torques", ("order",), ("order",), _three_torques, of("torque", _turned_round)),
+    Error("rotated commands", ("order",), ("order",), _three_commands, of("command", _turned_round)),
+    Error("rotated positions", ("order",), ("order",), _three_commands, of("position", _turned_round)),
+    Error("no motion", ("motion",), ("nothing moves",), _always, _standing),
+    Error("begins in motion", ("start",), ("begins while",), _command, _cut),
+    Error("commands beyond ctrlrange", ("scene",), ("ctrlrange",), _command, lambda r: r, _limited(0.5, torque=False)),
+    Error("torques beyond forcerange", ("scene",), ("forcerange",), _both, lambda r: r, _limited(0.5, torque=True)),
+    Error("a base that nothing holds", ("scene",), ("free", "base", "held"), _without_files, lambda r: r, _floating),
+    Error("a gap in time", ("clock",), ("gap",), _always, _silent),
+    Error("repeats that start apart", ("repeats",), ("apart",), _command, _apart),
+    Error(
+        "set-points that no replay uses",
+        ("unused",),
+        ("set-points",),
+        _command,
+        lambda r: replace(r, meta={**r.meta, "unused_setpoints": "velocity"}),
+    ),
 )

@@ -6,10 +6,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
-from two_link import ARM, measured, recording
+from two_link import ARM, JOINTS, measured, motion, recording
 
+from benchmarks.check_cases import RATE, played
+from benchmarks.check_cases import measured as recorded_channels
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
@@ -72,6 +75,79 @@ def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, cap
     path = save_recording(replace(log, channels=channels), tmp_path / "wave.npz")
     assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(tmp_path / "check")]) == 0
     assert "has no commands for shoulder" in " ".join(capsys.readouterr().out.split())
+
+
+PARAMETERS = [
+    *({"field": "dof_damping", "element": j, "unit": "N m s/rad", "std": 1.0, "high": 20.0} for j in JOINTS),
+    *({"field": "dof_frictionloss", "element": j, "mean": 0.1, "std": 0.1, "high": 2.0} for j in JOINTS),
+]
+
+
+@pytest.fixture
+def parameters(tmp_path: Path) -> Path:
+    (tmp_path / "parameters.json").write_text(json.dumps(PARAMETERS))
+    return tmp_path / "parameters.json"
+
+
+@pytest.mark.parametrize(
+    ("command", "next_step"),
+    [("identify", "droid_jax.identify.pipeline.prepare"), ("gap", "droid_jax.preflight.search_inputs.assigned_roles")],
+)
+def test_a_certain_finding_stops_a_fit_before_anything_is_compiled(
+    command: str, next_step: str, tmp_path: Path, scene: Path, parameters: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    log = wave()
+    turned = replace(log.channels["position"], values=-log.channels["position"].values)
+    path = save_recording(replace(log, channels={**log.channels, "position": turned}), tmp_path / "wave.npz")
+    files = ["--recording", str(path), "--scene", str(scene), "--parameters", str(parameters)]
+    call = [command, *files, "--out", str(tmp_path / "run")]
+
+    def reached(*_: object, **__: object) -> None:
+        raise ValueError("the fit would begin here")
+
+    monkeypatch.setattr(next_step, reached)
+    assert main(call) == 2
+    said = capsys.readouterr()
+    assert "runs against its command" in said.err and "or go on with --force" in said.err
+    assert "compiling" not in said.out and not (tmp_path / "run").exists()
+    assert main([*call, "--force"]) == 2
+    assert "the fit would begin here" in capsys.readouterr().err
+
+
+def poor() -> Recording:
+    """The elbow stands still: its damping and friction cannot be told."""
+    time, command = motion(3.0, RATE)
+    command = command * [0.2, 0.0] + [0.0, -0.3]
+    model = mujoco.MjModel.from_xml_string(
+        ARM.format(gravcomp='gravcomp="1"', friction='frictionloss="0.2"', sensor="")
+    )
+    model.opt.timestep = 1.0 / (4 * RATE)
+    torque, position = played(model, command[:, ::-1], command[0])
+    channels = recorded_channels(time, torque, position, 1, np.random.default_rng(0))
+    start = dict(zip(JOINTS, command[0].tolist(), strict=True))
+    return recording(time=time, command=command, channels={"position": channels["position"]}, qpos0=start)
+
+
+def test_what_a_motion_tells_and_what_would_tell_the_rest(
+    tmp_path: Path, scene: Path, parameters: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = save_recording(poor(), tmp_path / "wave.npz")
+    out = tmp_path / "check"
+    files = ["--recording", str(path), "--scene", str(scene), "--parameters", str(parameters)]
+    assert main(["check", *files, "--out", str(out)]) == 0
+    told = json.loads((out / "check.json").read_text())["excitation"]
+    assert told["engine"] == "mujoco"
+    open_ones = {p["name"] for p in told["parameters"] if not p["identifiable"]}
+    assert open_ones == {"elbow_damping"} == {*told["told_by_it"]} and told["left_open"] == []
+    assert told["addition"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "What these recordings tell of the parameters" in said and "record besides" in said
+    assert told["sentence"] in (out / "check.html").read_text()
+    table = np.genfromtxt(out / "addition.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("time", *JOINTS)
+    assert np.all(np.diff(table["time"]) > 0) and np.ptp([*table["shoulder"], *table["elbow"] + 0.3]) > 0.05
+    assert [table[j][k] for j in JOINTS for k in (0, -1)] == pytest.approx([0.0, 0.0, -0.3, -0.3])
 
 
 def test_bad_calls(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

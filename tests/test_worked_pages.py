@@ -12,7 +12,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"so101": "so101", "go2": "go2_leg", "xl330": "bam_xl330"}  # page -> folder of its data
+PAGES = {  # page -> folder of its data
+    "so101": "so101",
+    "go2": "go2_leg",
+    "xl330": "bam_xl330",
+    "panda": "franka_gaz2019",
+    "door": "door_pr2_ikea",
+}
+IN_N_M = ("panda", "door")  # torques are compared, else positions
 
 
 def commands(page: str) -> str:
@@ -22,7 +29,8 @@ def commands(page: str) -> str:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_files_that_a_page_names_are_there(page: str) -> None:
-    named = re.findall(r"experiments/[\w./]+", commands(page))
+    text = (ROOT / "docs" / f"{page}.md").read_text()
+    named = re.findall(r"experiments/[\w./]+\w", commands(page) + text)
     assert named and all((ROOT / name).is_file() for name in named)
 
 
@@ -36,6 +44,7 @@ def test_the_commands_of_a_page_run(page: str, shared_data: Callable[[str], Path
     )
     assert done.returncode == 0, done.stderr[-2000:]
     fit = json.loads((tmp_path / "runs" / page / "fit" / "fit.json").read_text())
-    errors = [distance["errors"]["position"] for distance in fit["heldout_distances"].values()]
+    channel = "torque" if page in IN_N_M else "position"
+    errors = [distance["errors"][channel] for distance in fit["heldout_distances"].values()]
     for error in errors:
         assert sum(error["mae_after"]) < sum(error["mae_before"])

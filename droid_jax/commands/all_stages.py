@@ -87,6 +87,8 @@ class All:
     """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
     """Seed of every stage and of the synthetic robot."""
+    force: bool = False
+    """Fit recordings too of which no fit can mean anything (`check`: certain); the report says so."""
     trials: int = 100
     """Trials of the policy on the synthetic robot, and episodes in simulation."""
     stages: tuple[Stage, ...] = STAGES
@@ -243,11 +245,14 @@ def _roles(command: All) -> tuple[str, ...]:
         needs_log(command.motion_cutoff, ())
         return tuple(DEMONSTRATIONS)
     from droid_jax.model.effects.registry import joined
+    from droid_jax.preflight.check_log import refuse_certain
     from droid_jax.preflight.search_inputs import assigned_roles
 
     own = gap.GapCommand(command.recording, preset=PRESETS[command.preset].identify, **_own(command))
     scene, base = gap.gap_model(own)
     given = gap.given_to(own)
+    if not command.force:
+        refuse_certain(scene, given)
     try:
         _, roles = assigned_roles(scene, given)
         if "gap" in command.stages:  # names that are taken are told now, and not after the fit
@@ -261,7 +266,16 @@ def _roles(command: All) -> tuple[str, ...]:
 
 def _own(command: All) -> dict[str, Any]:
     """The options of recordings, a scene and effects of your own, which both stages with them take."""
-    names = ("scene", "parameters", "joints", "object_joint", "joint_friction", "motion_cutoff", "user_effects")
+    names = (
+        "scene",
+        "parameters",
+        "joints",
+        "object_joint",
+        "joint_friction",
+        "motion_cutoff",
+        "user_effects",
+        "force",
+    )
     return {name: getattr(command, name) for name in names}
 
 

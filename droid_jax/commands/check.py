@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from droid_jax.identify.additions import MotionProposal
+    from droid_jax.identify.excitation import Excitation
     from droid_jax.preflight.findings import Finding
     from droid_jax.preflight.inspect_log import Signal
     from droid_jax.recordings.recording import Recording
 
+ADDITION = "addition.csv"  # in the folder: what to record besides
 COLOURS = {"certain": "bold red", "likely": "yellow", "note": "cyan"}
 
 
@@ -20,24 +23,31 @@ class CheckCommand:
     """Look at recordings before fitting them: rates, gaps, ranges, and what can hardly be right. No fit, seconds.
 
     With --scene also units, signs, order of joints, weight, gains, delays and limits are judged. A finding is certain
-    (no fit means anything), likely (something is wrong most often) or a note.
+    (no fit means anything), likely (something is wrong most often) or a note. With --parameters it also says which of
+    them these recordings can tell together, and which motion would tell the rest.
     """
 
     recording: tuple[Path, ...] = ()
     """Recordings, as `convert` writes them."""
     scene: Path | None = None
     """MJCF that they are meant for, with its nominal values."""
+    parameters: Path | None = None
+    """JSON list of the parameters that are to be fitted (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of the scene; default: all driven ones."""
     object_joint: str | None = None
     """Joint of the object that is moved."""
     out: Path = Path("runs/check")
-    """Folder of check.html and check.json."""
+    """Folder of check.html and check.json, and of addition.csv where a motion is proposed."""
 
 
 def run(command: CheckCommand) -> None:
     """Print the tables, and write page and JSON."""
+    from droid_jax import runtime
     from droid_jax.commands.options import recording_at
+
+    if command.parameters is not None and command.scene is not None:
+        runtime.start()  # before what is imported below starts jax
     from droid_jax.model.scene import load_scene
     from droid_jax.preflight.inspect_log import contents, inspect_log
     from droid_jax.report.check_page import check_page
@@ -45,8 +55,8 @@ def run(command: CheckCommand) -> None:
 
     if not command.recording:
         raise ValueError("check needs --recording, the recordings to look at (`convert` makes some of other logs)")
-    if command.scene is None and (command.joints or command.object_joint):
-        raise ValueError("--joints and --object-joint are of a scene: give --scene too")
+    if command.scene is None and (command.joints or command.object_joint or command.parameters):
+        raise ValueError("--joints, --object-joint and --parameters are of a scene: give --scene too")
     refuse_special(command.out, "a folder")
     recordings = [recording_at(path) for path in command.recording]
     checked = []
@@ -59,9 +69,70 @@ def run(command: CheckCommand) -> None:
         checked.append((recording, contents(recording), inspect_log(recording, scene)))
     for recording, tracks, findings in checked:
         _show(recording, tracks, findings)
-    page = check_page(checked, None if command.scene is None else command.scene.stem)
-    write_own(command.out, {"check.json": _json(command, checked), "check.html": page.encode()})
+    told, why = None, ""
+    if any(finding.severity == "certain" for _, _, findings in checked for finding in findings):
+        why = "a finding is certain"
+    elif command.parameters is not None:
+        try:
+            told = _excitation(command, recordings)
+        except ValueError as error:  # of the replay: what was found above is said all the same
+            why = str(error)
+    if command.parameters is not None and why:
+        print(f"which parameters these recordings tell was not looked at: {why}")
+    if told is not None:
+        _show_told(*told)
+    page = check_page(checked, None if command.scene is None else command.scene.stem, told)
+    files = {"check.json": _json(command, checked, told), "check.html": page.encode()}
+    if told is not None and told[1].chosen:
+        files[ADDITION] = _csv(told[1])
+        print(f"the motion, as commands: {command.out / ADDITION}; see that its way is free")
+    write_own(command.out, files)
     print(f"page: {command.out / 'check.html'}")
+
+
+def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple[Excitation, MotionProposal] | None:
+    """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
+    if command.parameters is None or command.scene is None:
+        return None
+    from droid_jax.identify.additions import propose
+    from droid_jax.identify.excitation import excitation
+    from droid_jax.model.parameter_file import friction_joints, load_parameters
+    from droid_jax.model.scene import load_scene
+
+    joints = command.joints or (() if recordings[0].command.size else _measured(recordings[0]))
+    rows = friction_joints(command.parameters)
+    scene = load_scene(
+        command.scene, joints=joints or None, object_joint=command.object_joint, friction_joints=rows, hold=True
+    )
+    space = load_parameters(command.parameters, scene)
+    found = excitation(scene, space, recordings)
+    return found, propose(scene, space, found, recordings[0])
+
+
+def _show_told(found: Excitation, proposal: MotionProposal) -> None:
+    """The table of parameters on the terminal, and the sentence below it."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    table = Table(title=Text("What these recordings tell of the parameters, before a fit"))
+    for name in ("parameter", "unit", "of the prior's width left", "identifiable", "trades with"):
+        table.add_column(name, overflow="fold")
+    for parameter, told in zip(found.space.parameters, found.told, strict=True):
+        partners = ", ".join(f"{name} ({value:+.2f})" for name, value in told.partners)
+        cells = (parameter.name, parameter.unit, f"{100 * told.shrinkage:.0f} %", "yes" if told.identifiable else "no")
+        table.add_row(*map(Text, (*cells, partners)))
+    console.print(table)
+    console.print(Text(proposal.sentence))
+
+
+def _csv(proposal: MotionProposal) -> bytes:
+    """The commands of a proposal: time, s, and the joints, rad or m."""
+    time, rows = proposal.commands()
+    lines = [",".join(("time", *proposal.joints))]
+    lines += [",".join(f"{value:.6g}" for value in (t, *row)) for t, row in zip(time, rows, strict=True)]
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _measured(recording: Recording) -> tuple[str, ...]:
@@ -93,7 +164,11 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
         console.print(Text.assemble((f"{finding.severity}: ", COLOURS[finding.severity]), finding.sentence))
 
 
-def _json(command: CheckCommand, checked: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]]) -> bytes:
+def _json(
+    command: CheckCommand,
+    checked: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
+    told: tuple[Excitation, MotionProposal] | None,
+) -> bytes:
     """The content of check.json."""
     import json
 
@@ -113,5 +188,19 @@ def _json(command: CheckCommand, checked: Sequence[tuple[Recording, Sequence[Sig
         }
         for path, (recording, tracks, findings) in zip(command.recording, checked, strict=True)
     ]
-    whole = {"format": "droid_jax check 1", "scene": None if command.scene is None else str(command.scene)}
+    whole: dict[str, object] = {
+        "format": "droid_jax check 1",
+        "scene": None if command.scene is None else str(command.scene),
+    }
+    if told is not None:
+        found, proposal = told
+        whole["excitation"] = {
+            "parameters": [column(asdict(t)) for t in found.told],
+            "engine": found.engine,
+            "seconds": found.seconds,
+            "sentence": proposal.sentence,
+            "addition": [a.what for a in proposal.chosen],
+            "told_by_it": list(proposal.opened),
+            "left_open": list(proposal.left),
+        }
     return (json.dumps({**whole, "recordings": recordings}, indent=1, allow_nan=False) + "\n").encode()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from droid_jax.commands import report
@@ -37,6 +37,7 @@ def run(command: EvaluateFit) -> None:
 
     runtime.start()
     from droid_jax.identify.evaluation import evaluate_on, evaluation_json, evaluation_traces
+    from droid_jax.preflight.check_log import check_log
     from droid_jax.report.evaluation_folder import is_evaluation, read_evaluation
     from droid_jax.report.text import lines
     from droid_jax.storage import refuse_foreign, write_json, write_npz
@@ -70,6 +71,7 @@ def run(command: EvaluateFit) -> None:
             "scene": model.scene.name,
             "effects": [effect.name for effect in model.effects],
             **evaluation_json(replays, model.recordings),
+            "findings": [asdict(f) for recording in recordings for f in check_log(model.scene, recording)],
             "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "versions": runtime.versions(),
             "device": runtime.device(),

@@ -40,7 +40,7 @@ INPUTS = ("start", "synthetic_robot")  # in a setup: of what a run was given by 
 def setup_of(command: Any) -> dict[str, Any]:
     """What decides a run's results, as plain data: a finished run with the same is not run again."""
     fields = dataclasses.asdict(command)
-    for name in ("out", "again", "tensorboard"):
+    for name in ("out", "again", "force", "tensorboard"):
         fields.pop(name, None)
     for name in HASHED:  # a changed file makes another run
         if path := fields.get(name):

@@ -105,6 +105,8 @@ class GapCommand:
     """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
     """Seed of the search, of the synthetic robot and of the resamples."""
+    force: bool = False
+    """Search a recording too of which no fit can mean anything (`check`: certain); the report says so."""
     tensorboard: bool = False
     """Write scalars of the base fit for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/gap")
@@ -127,7 +129,7 @@ def run(command: GapCommand) -> None:
     from droid_jax.discrepancy.log_case import case_of, open_loop_errors
     from droid_jax.discrepancy.results import write_amended, write_gap
     from droid_jax.identify.results import prepare_folder
-    from droid_jax.preflight.check_log import check_log
+    from droid_jax.preflight.check_log import check_log, refuse_certain
     from droid_jax.preflight.search_inputs import assigned_roles
     from droid_jax.recordings.split import Split
     from droid_jax.synthetic.hidden_effects import in_words
@@ -149,6 +151,8 @@ def run(command: GapCommand) -> None:
         _done(out)
         return
     known = not command.again and to_be_amended(out)  # its verdict is there and stays there
+    if not command.force:
+        refuse_certain(scene, given)
     judges = given[len(command.recording) :]
     fitted = given[: len(command.recording)]
     split, roles = assigned_roles(scene, fitted, judges) if given else (Split.RECORDINGS, {})

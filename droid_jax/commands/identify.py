@@ -103,6 +103,8 @@ class Identify:
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     seed: int = 0
     """Seed of the search, of the synthetic robot and of the samples."""
+    force: bool = False
+    """Fit a recording too of which no fit can mean anything (`check`: certain); the report says so."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/identify")
@@ -125,7 +127,7 @@ def run(command: Identify) -> None:
     from droid_jax.identify.pipeline import cost_samples, prepare, run_fit
     from droid_jax.identify.results import prepare_folder, write_run
     from droid_jax.identify.solution_checks import creep_of_fit
-    from droid_jax.preflight.check_log import check_log
+    from droid_jax.preflight.check_log import check_log, refuse_certain
     from droid_jax.preflight.preflight import command_notes
     from droid_jax.report.identify_folder import read_fit
     from droid_jax.report.progress import FOLDER, scalars, stages
@@ -145,6 +147,8 @@ def run(command: Identify) -> None:
         return
     config = identify_config(command)
     _needs_demonstrations(command, given)
+    if not command.force:
+        refuse_certain(scene, (*given, *judges))
     prepare_folder(out)  # only now, with all input read
     recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
@@ -180,7 +184,7 @@ def run(command: Identify) -> None:
                 *(text for recording in recordings for text in command_notes(scene, recording)),
                 *creep_of_fit(scene, found.full, found.best, recordings),
             ],
-            findings=[finding for recording in recordings for finding in check_log(scene, recording)],
+            findings=[finding for recording in (*recordings, *judges) for finding in check_log(scene, recording)],
         )  # fmt: skip
     draw_replay(out, scene)
     report.run(report.Report(out))

@@ -91,6 +91,15 @@ class Cost:
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
 
+    def whitened_of(self, rollouts: Sequence[Rollout]) -> np.ndarray:
+        """[P, M] residuals in noise units of replays that were made, one Rollout [P, T, ...] for each recording."""
+        parts = [np.asarray(f(rollout)) for f, rollout in zip(self._whitened, rollouts, strict=True)]
+        return np.concatenate(parts, axis=1)
+
+    def compared_by(self, comparisons: Sequence[Comparison]) -> Cost:
+        """The same replays, compared in another way: by comparisons of the same recordings."""
+        return assemble(self.scene, self.space, comparisons, self._replays, self.drives)
+
     def first(self) -> Cost:
         """The cost of the first recording alone, on the same compiled functions."""
         each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
@@ -100,7 +109,7 @@ class Cost:
         """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
         rollouts = [jax.tree.map(lambda a: a[0], r) for r in self.rollouts(values[None])]
         made = [c.restated(r) if c.repeats == 1 else c for c, r in zip(self.comparisons, rollouts, strict=True)]
-        return assemble(self.scene, self.space, made, self._replays, self.drives)
+        return self.compared_by(made)
 
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings, or in another way.

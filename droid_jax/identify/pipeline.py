@@ -19,7 +19,7 @@ from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import WORTH, HeldoutDistance, heldout_distances, split_repeats
+from droid_jax.identify.holdout import WORTH, HeldoutDistance, beginning, heldout_distances, split_repeats
 from droid_jax.identify.identifiability import (
     Identifiability,
     IdentifiabilityConfig,
@@ -140,7 +140,6 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
-LONG = 1.5  # times the beginning, from which on a recording is long
 FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
 FEWEST = 16  # samples of a Gaussian that show its spread
 FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
@@ -261,7 +260,7 @@ def prepare(
         else make_cost(scene, full, held, engine=engine.engine, config=plain, effects=effects, check=False)
     )
     _check_start(base, full)
-    begun = [_beginning(recording, config.beginning) for recording in fitted]
+    begun = [beginning(recording, config.beginning) for recording in fitted]
     early = base
     if any(short is not recording for short, recording in zip(begun, fitted, strict=True)):
         comparing = base.comparisons[0].config
@@ -393,17 +392,6 @@ def _check_start(cost: Cost, space: Space) -> None:
                 f"{f' ({why})' if why else ''}: shorten the scene's time step, give light joints armature, or begin at "
                 "other means (stiff servos on light links are the usual cause)"
             )
-
-
-def _beginning(recording: Recording, seconds: float) -> Recording:
-    """A long commanded recording's first seconds, and more until its commands have covered half of their range."""
-    begin, end = recording.span
-    if not recording.command.size or end - begin <= LONG * seconds:
-        return recording
-    reach = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
-    moved = recording.time[int(np.argmax(np.all(reach >= 0.5 * reach[-1], axis=1)))]
-    until = max(begin + seconds, float(moved))
-    return recording if until > begin + (end - begin) / LONG else recording.window(begin, until)
 
 
 def _refined(

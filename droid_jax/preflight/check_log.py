@@ -2,13 +2,15 @@
 
 `check_log` compares what is in the recording with what the scene expects at its nominal values.  An alternative is
 named only where the recording as stated explains hardly anything and the alternative nearly everything, so a model
-that is merely wrong raises nothing.  Nothing is refused: what is found is said, and stands in the results.
+that is merely wrong raises nothing.  What is found is said, and stands in the results; `refuse_certain` stops a fit
+that could not mean anything.
 """
 
 from __future__ import annotations
 
 import warnings
 import weakref
+from collections.abc import Iterable
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.clocks import check_clocks, check_stamps
@@ -44,7 +46,7 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
                 wrong = check_torque(scene, recording, motion) or check_servo_balance(scene, recording, motion)
-                clocks = any(finding.kind == "clock" for finding in found)
+                clocks = any(f.kind == "clock" and f.severity != "note" for f in found)
                 found += wrong or ([] if clocks else check_delay(scene, recording, motion))
         known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
@@ -66,6 +68,16 @@ def _unused(recording: Recording) -> list[Finding]:
         "uses: a servo that follows them lags less than its replay, which looks like damping, a delay or another gain"
     )
     return [Finding("unused", fields, 1.0, 0.0, "note", sentence)]
+
+
+def refuse_certain(scene: Scene, recordings: Iterable[Recording]) -> None:
+    """Raise ValueError for recordings of which no fit can mean anything: those with a finding that is certain."""
+    said = [f.sentence for recording in recordings for f in check_log(scene, recording) if f.severity == "certain"]
+    if said:
+        raise ValueError(
+            f"{'; '.join(dict.fromkeys(said))}: no fit of it means anything; `check` shows everything that was found. "
+            "Mend the recording or the scene, or go on with --force"
+        )
 
 
 def warn_of_log(scene: Scene, recording: Recording) -> None:

@@ -15,17 +15,57 @@ NEAR = 0.05  # relative deviation within which two rates are meant to be one
 LATEST = 1.0  # s: a drift that is looked for
 WINDOWS, EVEN = 4, 0.6  # parts in which a lag is looked for; deviation of its steps from a line, of the drift
 WINDOW = 0.25  # share of a recording that each part has
+FEW = 10  # stamps, below which a clock's unit is not judged
+SLOWEST, QUICKEST = 0.45, 2e-5  # s between samples: stamps in ms of 2 kHz at most, or in thousands of s of 50 Hz
+GAP, LONG = 5.0, 0.03  # usual steps, and s: a longer step is a gap
 RATES = ("rate", "rate_hz", "frequency", "frequency_hz", "fps", "hz")  # in `meta`
 
 
 def check_clocks(scene: Scene, recording: Recording) -> list[Finding]:
     """What is wrong with the clocks."""
-    return check_stamps(recording) or _drift(scene, recording)
+    stamps = check_stamps(recording)
+    return stamps if any(f.severity != "note" for f in stamps) else [*stamps, *_drift(scene, recording)]
 
 
 def check_stamps(recording: Recording) -> list[Finding]:
     """The same as far as no scene is needed."""
-    return _rows(recording) or _nominal(recording)
+    return _unit(recording) or [*(_rows(recording) or _nominal(recording)), *_gaps(recording)]
+
+
+def _gaps(recording: Recording) -> list[Finding]:
+    """Times of which a channel has no sample in any repeat."""
+    for key, channel in recording.channels.items():
+        steps = np.diff(channel.time)
+        usual = float(np.median(steps)) if len(steps) else np.inf
+        if len(steps) and steps.max() > max(GAP * usual, LONG):
+            at = float(channel.time[int(np.argmax(steps))])
+            count = int(np.sum(steps > GAP * usual))
+            return [
+                Finding(
+                    "clock", key, float(steps.max()), usual, "note",
+                    f"recording {recording.name!r}: channel {key!r} has {'a gap' if count == 1 else f'{count} gaps'} "
+                    f"in time, the longest of {steps.max():.2g} s at {at:.4g} s: what is not measured is not compared",
+                )
+            ]  # fmt: skip
+    return []
+
+
+def _unit(recording: Recording) -> list[Finding]:
+    """Stamps so far apart, or so close together, that they are in no seconds."""
+    clocks = [("the commands", recording.time)] if recording.command.size else []
+    clocks += [(f"channel {key!r}", channel.time) for key, channel in recording.channels.items()]
+    for what, time in clocks:
+        step = float(np.median(np.diff(time))) if len(time) > FEW else 0.0
+        if step > SLOWEST or 0 < step < QUICKEST:
+            unit = "milliseconds, or shorter" if step > SLOWEST else "thousands of seconds"
+            return [
+                Finding(
+                    "clock", what, step, SLOWEST if step > SLOWEST else QUICKEST, "certain",
+                    f"recording {recording.name!r}: the steps of {what} are {step:.3g} s: are the stamps in {unit}? "
+                    "`convert --units time=ms` (us, ns) reads them",
+                )
+            ]  # fmt: skip
+    return []
 
 
 def _rows(recording: Recording) -> list[Finding]:

@@ -7,7 +7,7 @@ from typing import Literal
 
 Kind = Literal[
     "units", "sign", "order", "gravity", "gains", "clock", "delay", "repeats", "sensor", "saturation", "unused",
-    "range", "start", "scene",
+    "range", "start", "scene", "motion",
 ]  # fmt: skip
 
 

@@ -10,9 +10,12 @@ import numpy as np
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import check_alone, check_log
+from droid_jax.preflight.clocks import GAP
 from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
 from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.inverse_dynamics import prescribed
+from droid_jax.simulate.replay import make_drive
 
 ORDER = ("certain", "likely", "note")
 
@@ -32,10 +35,20 @@ def inspect_log(recording: Recording, scene: Scene | None = None) -> tuple[Findi
     found: list[Finding] = []
     found += _said("range", lambda: check_range(scene, recording))
     found += check_log(scene, recording)
+    if not found or found[0].kind != "range":
+        found += _said("scene", lambda: _replayable(scene, recording))
     if recording.command.size:
         found += _said("start", lambda: warn_if_moving(recording))
         found += [Finding("scene", "", 0.0, 0.0, "note", text) for text in _notes(scene, recording)]
     return _sorted(found)
+
+
+def _replayable(scene: Scene, recording: Recording) -> None:
+    """Raise ValueError where no replay can follow the recording; that it lacks commands `_notes` says."""
+    if not recording.command.size:
+        prescribed(scene, recording)
+    elif set(scene.needs_command) <= set(recording.command_names):
+        make_drive(scene, recording, weigh="torque" in recording.channels)
 
 
 def _notes(scene: Scene, recording: Recording) -> list[str]:
@@ -64,9 +77,6 @@ def _said(kind: Kind, check: Callable[[], None]) -> list[Finding]:
 
 def _sorted(found: list[Finding] | tuple[Finding, ...]) -> tuple[Finding, ...]:
     return tuple(sorted(found, key=lambda finding: ORDER.index(finding.severity)))
-
-
-GAP = 5.0  # usual steps: a longer one is a gap
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Repeats that are copies, and columns that a sensor did not measure."""
+"""Repeats that are copies, columns that a sensor did not measure, and recordings in which nothing moves."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from droid_jax.simulate.repeat_starts import spread
 COPY = 1e-6  # of a channel's size: repeats that differ by less were measured once (float32 rounds by less)
 LEVELS = 8  # a column that moves and takes no more different values is coarse
 RESTS = {"position": 0.02, "velocity": 0.1, "torque": 0.2}  # rad, rad/s, N m: a column that changes by less may rest
+SENT = 1e-4  # of a command's own unit: one that changes by less is constant
+STANDS = {"rad": 5e-3, "m": 5e-4}  # a column that was measured to move by less rests, but for its encoder's steps
+SHORT = 40  # rows below which a recording is not called motionless
+STRAYS = 0.01  # share of the samples at both ends that may be outliers
 NAMED = 3  # pairs of copies that are named
 
 
@@ -20,7 +24,27 @@ def check_repeats(recording: Recording) -> list[Finding]:
     """What is wrong with the repeats and the sensors."""
     where = f"recording {recording.name!r}"
     sensors = [finding for channel in recording.channels.values() for finding in _sensors(channel, where)]
-    return _copies(recording, where) + sensors + _dead(recording, where) + _apart(recording, where)
+    found = _copies(recording, where) + sensors + _dead(recording, where) + _apart(recording, where)
+    return found + _motionless(recording, where)
+
+
+def _motionless(recording: Recording, where: str) -> list[Finding]:
+    """A recording in which no command changes and no joint moves."""
+    rows = max(len(recording.time), *(len(c.time) for c in recording.channels.values()))
+    if rows < SHORT or (recording.command.size and np.ptp(recording.command, axis=0).max() > SENT):
+        return []
+    most = 0.0
+    for channel in (recording.channels[key] for key in ("position", "object_angle") if key in recording.channels):
+        for c in range(len(channel.columns)):
+            values = channel.values[..., c][channel.mask[..., c]]
+            low, high = np.quantile(values, [STRAYS, 1 - STRAYS]) if values.size else (0.0, 0.0)
+            if high - low > min(STANDS.get(unit, 0.0) for unit in channel.unit.split(" or ")):
+                return []
+            most = max(most, float(high - low))
+    if not recording.command.size and not {"position", "object_angle"} & {*recording.channels}:
+        return []
+    sentence = f"{where}: nothing moves in it (by {most:.2g} at most): record a motion, which tells the parameters"
+    return [Finding("motion", "", most, STANDS["rad"], "certain", sentence)]
 
 
 def _dead(recording: Recording, where: str) -> list[Finding]:

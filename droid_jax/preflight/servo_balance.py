@@ -47,7 +47,7 @@ def check_servo_balance(scene: Scene, recording: Recording, motion: LogMotion) -
     for one, other in itertools.combinations(known, 2):
         if one in bad or other in bad:
             words = f"{one} and {other} seem to be exchanged in all channels: check the columns' names"
-            tried.append(("order", one, words, motion.swapped(one, other)))
+            tried.append(("order", one, words, motion.renamed({one: other, other: one})))
     lefts = [_balance(scene, stated_as, other)[0] for _, _, _, other in tried]
     right = [i for i, left in enumerate(lefts) if explains(left, stated, bad)]
     if right:

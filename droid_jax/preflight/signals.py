@@ -69,9 +69,8 @@ class LogMotion:
         """The same motion with a joint's position negated."""
         return replace(self, position={j: -x if j == joint else x for j, x in self.position.items()})
 
-    def swapped(self, first: str, second: str) -> LogMotion:
-        """The same motion with two joints' columns exchanged in all signals."""
-        names = {first: second, second: first}
+    def renamed(self, names: Mapping[str, str]) -> LogMotion:
+        """The same motion with columns under other joints' names in all signals; names: of those that change."""
 
         def exchanged(traces: Traces) -> dict[str, np.ndarray]:
             return {names.get(joint, joint): x for joint, x in traces.items()}

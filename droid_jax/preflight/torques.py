@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.optimize import lsq_linear
+from scipy.optimize import linear_sum_assignment, lsq_linear
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding, Kind
@@ -37,6 +37,8 @@ BAD = 0.3  # share of a torque's mean square that stays unexplained, from which 
 GOOD = 0.2  # share below which an alternative explains it,
 BETTER = 0.25  # and of what the expectation left
 VISIBLE, CLEARLY = 0.03, 0.1  # share from which on the weight in a torque is looked for, and what it must leave of it
+ROUGH = 400  # rows of a motion at which alternatives are tried where the expectation has not failed
+MOST = 3  # joints of which all orders of the positions are tried
 ROTOR = 100.0  # times a link's own inertia, that a rotor behind its gear may have
 SURE = 0.05  # share below which it does so beyond doubt
 SAME = 0.25  # relative deviation within which a factor is that of degrees
@@ -127,26 +129,30 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     if found := _of_gravity(recording, stated, weightless, "the rigid body's torques"):
         return found
     bad = [joint for joint, left in stated.items() if left > BAD]
-    if not bad:
+    if not stated or (not bad and _mean(stated) < VISIBLE):
         return []
     whole: list[tuple[Kind, str, dict[str, float], str]] = []
+    if not bad:
+        motion = replace(motion, rows=ROUGH)
 
-    def tried(kind: Kind, joint: str, words: str, other: LogMotion, swap: bool = True) -> None:
-        mine = {j: (other if swap else motion).torque[j][motion.inner] for j in torques}
-        left = lefts(rigid_body(scene, recording, other), mine, gravity)
-        whole.append((kind, joint, left, words))
+    def tried(kind: Kind, joint: str, words: str, other: LogMotion, columns: LogMotion) -> None:
+        """columns: whose torques are compared with the bodies of `other`."""
+        mine = {j: columns.torque[j][columns.inner] for j in torques}
+        whole.append((kind, joint, lefts(rigid_body(scene, recording, other), mine, gravity), words))
 
-    tried("units", "", "the positions are not in the unit that is stated: are these degrees?", motion.scaled(DEGREE))
+    words = "the positions are not in the unit that is stated: are these degrees?"
+    tried("units", "", words, motion.scaled(DEGREE), motion)
     for joint in bodies:
-        tried("sign", joint, f"the position of {joint} has the wrong sign", motion.turned(joint))
-    for one, other in itertools.combinations(bodies, 2):
-        names = {one: other, other: one}
-        if one in bad or other in bad:
-            swapped = {j: torques[names.get(j, j)] for j in torques}
-            whole.append(("order", one, lefts(bodies, swapped, gravity), _order_words(one, other, "torque")))
-            tried("order", one, _order_words(one, other, "position"), motion.swapped(one, other), swap=False)
-            tried("order", one, _order_words(one, other, "all channels"), motion.swapped(one, other))
-    explained = [w for w in whole if explains(w[2], stated, bad)]
+        tried("sign", joint, f"the position of {joint} has the wrong sign", motion.turned(joint), motion)
+    each = {j: {k: left_by_body(torques[k], bodies[j], gravity=gravity, motor=motor) for k in torques} for j in bodies}
+    order = fitting_order(each)
+    if moved := [j for j, k in order.items() if j != k]:
+        whole.append(("order", moved[0], {j: each[j][k] for j, k in order.items()}, _order_words(order, "torque")))
+    for order in _orders(list(bodies)):
+        other = motion.renamed({column: joint for joint, column in order.items()})
+        tried("order", next(iter(order)), _order_words(order, "position"), other, motion)
+        tried("order", next(iter(order)), _order_words(order, "all channels"), other, other)
+    explained = [w for w in whole if explains(w[2], stated, bad or list(stated), 1.0 if bad else CLEARLY)]
     others_right = len(bad) < len(bodies)
     alone = {
         joint: _alone(joint, torques[joint], bodies[joint], gravity, motor, stated[joint], others_right)
@@ -154,13 +160,14 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     }
     best = min(explained, key=lambda w: _mean(w[2]), default=None)
     where = f"recording {recording.name!r}: "
-    if best is not None and not all(f is not None and f[1] <= best[2][j] + 0.02 for j, f in alone.items()):
+    if best is not None and not (bad and all(f is not None and f[1] <= best[2][j] + 0.02 for j, f in alone.items())):
         kind, joint, left, words = best
-        most = max(bad, key=lambda j: stated[j])
+        most = max(bad or stated, key=lambda j: stated[j])
         return [
             _finding(kind, joint or most, most, stated[most], left[most], where + words, "the rigid body's torques")
         ]
-    return [replace(f[0], sentence=where + f[0].sentence) for f in alone.values() if f is not None]
+    found = [replace(f[0], sentence=where + f[0].sentence) for f in alone.values() if f is not None]
+    return _register(found, list(torques))
 
 
 def _of_gravity(
@@ -174,10 +181,34 @@ def _of_gravity(
     return [_finding("gravity", most, most, stated[most], other[most], words, by)]
 
 
-def explains(left: Mapping[str, float], stated: Mapping[str, float], bad: Sequence[str]) -> bool:
-    """Whether an alternative explains the torques of the joints where the expectation failed, and spoils no other."""
+def fitting_order(left: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    """Joint -> the joint as whose its column was recorded, of all orders the one that leaves least.
+
+    left: joint -> column -> share of the column's torque that the joint's expectation leaves.
+    """
+    joints = list(left)
+    if not joints:
+        return {}
+    rows, columns = linear_sum_assignment([[left[j][k] for k in joints] for j in joints])
+    return {joints[i]: joints[k] for i, k in zip(rows, columns, strict=True)}
+
+
+def _orders(joints: Sequence[str]) -> list[dict[str, str]]:
+    """Other orders of the joints, the changes alone: all of up to three joints, else two exchanged."""
+    if len(joints) > MOST:
+        return [{one: other, other: one} for one, other in itertools.combinations(joints, 2)]
+    every = [dict(zip(joints, order, strict=True)) for order in itertools.permutations(joints)]
+    return [{j: k for j, k in order.items() if j != k} for order in every[1:]]
+
+
+def explains(left: Mapping[str, float], stated: Mapping[str, float], bad: Sequence[str], share: float = 1.0) -> bool:
+    """Whether an alternative explains the torques of the joints where the expectation failed, and spoils no other.
+
+    share: of what the expectation leaves, that the alternative may at most.
+    """
     spoilt = [j for j in left if left[j] > max(BAD, stated[j] + 0.05)]
-    return not spoilt and _better(float(np.mean([left[j] for j in bad])), float(np.mean([stated[j] for j in bad])))
+    mine, before = (float(np.mean([of[j] for j in bad])) for of in (left, stated))
+    return not spoilt and _better(mine, before) and mine < share * before
 
 
 def _better(left: float, stated: float) -> bool:
@@ -195,7 +226,10 @@ def _alone(
     if _better(turned := left(-torque), stated):
         words = f"the torque of {joint} has the wrong sign, or its position has"
         return _finding("sign", joint, joint, stated, turned, words, by, value=-1.0), turned
-    if size > 0 and not 1 / BOUND < size < BOUND and _better(scaled := left(torque / size), stated):
+    if size != 0 and not 1 / BOUND < abs(size) < BOUND and _better(scaled := left(torque / size), stated):
+        if size < 0:
+            words = f"the torque of {joint} is {size:.2g} of what the motion takes"
+            return _finding("sign", joint, joint, stated, scaled, words, by, value=size), scaled
         weight = gravity and np.std(body.weight) + np.abs(np.mean(body.weight)) > np.std(body.inertial)
         of = "the arm's weight there" if weight else "what the motion takes"
         words = f"the torque of {joint} is {size:.2g} of {of}: {_unit_words(size)}"
@@ -278,10 +312,14 @@ def _compared(
     where = f"recording {recording.name!r}: "
     stated = {j: _least(torque, expected[j]) for j, torque in torques.items()}
     bad = [j for j, share in stated.items() if share > BAD]
-    for one, other in itertools.combinations(bad, 2):
-        crossed = max(_least(torques[one], expected[other]), _least(torques[other], expected[one]))
-        if _better(crossed, min(stated[one], stated[other])):
-            return [_finding("order", one, one, stated[one], crossed, where + _order_words(one, other, "torque"), by)]
+    each = {j: {k: _least(torques[k], expected[j]) for k in torques} for j in torques}
+    order = {j: k for j, k in fitting_order(each).items() if j != k}
+    if order and float(np.mean([stated[j] for j in order])) > VISIBLE:
+        left = {j: each[j][k] for j, k in order.items()}
+        if explains(left, stated, list(order)):
+            most = max(order, key=lambda j: stated[j])
+            words = where + _order_words(order, "torque")
+            return [_finding("order", most, most, stated[most], left[most], words, by)]
     found, sizes = [], {}
     for joint, torque in torques.items():
         if joint in bad and _better(turned := _least(-torque, expected[joint]), stated[joint]):
@@ -290,6 +328,12 @@ def _compared(
             continue
         like = _likest(torque, expected[joint])
         size, share = factor(torque, like), _least(torque, [like])
+        inverse = factor(torque, turned := _likest(torque, [-x for x in expected[joint]]))
+        far = inverse >= BOUND or 0 < inverse <= 1 / BOUND
+        if joint in bad and far and _better(left := _least(torque / inverse, [turned]), share):
+            words = f"{where}the torque of {joint} is {-inverse:.2g} of {by}"
+            found.append(_finding("sign", joint, joint, share, left, words, by, value=-inverse))
+            continue
         other = size > 0 and not 1 / BOUND < size < BOUND
         if share > BAD and other and _better(scaled := _least(torque / size, [like]), share):
             sizes[joint] = size, share, scaled
@@ -303,7 +347,22 @@ def _compared(
             why = f"{_unit_words(size)} Or are the servo's gains in the MJCF others than the robot's?"
         words = f"{where}the torque of {joint} is {size:.2g} of {by}: {why}"
         found.append(_finding("units", joint, joint, share, scaled, words, by, value=size))
-    return found
+    return _register(found, list(torques))
+
+
+def _register(found: list[Finding], joints: Sequence[str]) -> list[Finding]:
+    """The findings, with what torques of the other sign may be where most joints have them.
+
+    A servo's load register states the drive's duty as a share, often of the other sign.
+    """
+    turned = [f for f in found if f.kind == "sign" and f.value < 0]
+    if 2 * len(turned) <= len(joints):
+        return found
+    register = (
+        "{}; or is this a load register, the share that the drive puts out, and no torque? Leave that column out then, "
+        "and fit the positions"
+    )
+    return [replace(f, sentence=register.format(f.sentence)) if f in turned else f for f in found]
 
 
 # Words ----------------------------------------------------------------------------------------
@@ -336,8 +395,13 @@ def _weight_words(gravity: bool) -> str:
     )
 
 
-def _order_words(one: str, other: str, what: str) -> str:
-    return f"{one} and {other} seem to be exchanged in {what}: check the columns' names"
+def _order_words(order: Mapping[str, str], what: str) -> str:
+    """order: joint -> the joint under whose name its column stands."""
+    moved = {j: k for j, k in order.items() if j != k}
+    if len(moved) == 2:
+        return f"{' and '.join(moved)} seem to be exchanged in {what}: check the columns' names"
+    named = ", ".join(f"{k} is {j}" for j, k in moved.items())
+    return f"joints seem to be in another order in {what} (what is called {named}): check the columns' names"
 
 
 def _mean(lefts: Mapping[str, float]) -> float:

@@ -16,6 +16,8 @@ LATEST = 0.15  # s by which a position may lag its command; of faster swings tha
 FOLLOWS = 0.9  # correlation from which on a position follows a command, and its size can be compared
 AGAINST = -0.8  # correlation at which it runs against it
 UNRELATED = 0.3  # correlation below which it does not follow its own command at all
+UNLIKE = 0.02  # share of the positions' variance that the stated order leaves, from which on another is looked for
+BETTER = 0.2  # of that share, which the other order may leave
 RATIO = 3.0  # a servo that goes a third, or three times, as far as it is sent has other units
 SAME = 0.25  # relative deviation within which a ratio is that of known units
 STUCK = 1e-3  # of the way it is sent: a position that moves less does not move, or is not measured
@@ -89,13 +91,18 @@ def _ratio(scene: Scene, joint: str, ratio: float, where: str) -> Finding:
 
 
 def _order(motion: LogMotion, joints: list[str], where: str) -> list[Finding]:
-    """Joints of which each follows another one's command, and not its own."""
+    """Joints of which each follows another one's command, and not its own: of all orders the one that fits best."""
     if len(joints) < 2:
         return []
     r = np.array([[correlations(motion, sent, seen)[0].max() for sent in joints] for seen in joints])
     seen, sent = linear_sum_assignment(-r)
     wrong = [(i, j) for i, j in zip(seen, sent, strict=True) if i != j]
-    if not wrong or any(r[i, i] > UNRELATED or r[i, j] < FOLLOWS for i, j in wrong):
+    if not wrong or any(r[i, j] < FOLLOWS for i, j in wrong):
+        return []
+    share = 1 - np.maximum(r, 0.0) ** 2  # of a position's variance that a command leaves
+    unlike = float(np.mean([share[i, i] for i, _ in wrong]))
+    left = float(np.mean([share[i, j] for i, j in wrong]))
+    if unlike < UNLIKE or left > BETTER * unlike:  # commands that are much alike tell no order
         return []
     pairs = ", ".join(f"{joints[i]} follows the command of {joints[j]}" for i, j in wrong)
     first = int(wrong[0][0])
@@ -103,7 +110,8 @@ def _order(motion: LogMotion, joints: list[str], where: str) -> list[Finding]:
         f"{where}: the joints seem to be in another order in positions than in commands ({pairs}): check the columns' "
         "names"
     )
-    return [Finding("order", joints[first], float(r[first, first]), 1.0, "certain", sentence)]
+    sure = all(r[i, i] < UNRELATED for i, _ in wrong)
+    return [Finding("order", joints[first], float(r[first, first]), 1.0, "certain" if sure else "likely", sentence)]
 
 
 def _too_fast(scene: Scene, motion: LogMotion, where: str) -> list[Finding]:

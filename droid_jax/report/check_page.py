@@ -9,6 +9,8 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from droid_jax.identify.additions import MotionProposal
+from droid_jax.identify.excitation import Excitation
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.inspect_log import Signal
 from droid_jax.recordings.recording import Recording
@@ -30,13 +32,21 @@ DRAWN = 1200  # points of a line at most
 MOST = 12  # joints that are drawn
 
 
-def check_page(recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]], scene: str | None) -> str:
-    """HTML of recordings with what they hold and what was found in them; scene: the name of the one they are for."""
+def check_page(
+    recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
+    scene: str | None,
+    told: tuple[Excitation, MotionProposal] | None = None,
+) -> str:
+    """HTML of recordings with what they hold and what was found in them.
+
+    scene: the name of the one they are for.  told: which parameters they tell, and what would tell the rest.
+    """
     parts: list[dict[str, Any]] = []
     for i, (recording, tracks, findings) in enumerate(recordings):
         figure = Markup(inline_svg(settled(signals(recording)), f"f{i}"))
         parts.append({"recording": recording, "tracks": tracks, "findings": findings, "figure": figure})
-    return html("check.html.jinja", parts=parts, scene=scene)
+    rows = [] if told is None else list(zip(told[0].space.parameters, told[0].told, strict=True))
+    return html("check.html.jinja", parts=parts, scene=scene, rows=rows, sentence=told[1].sentence if told else "")
 
 
 @styled

@@ -13,7 +13,7 @@ from msgspec import Struct, field
 from droid_jax.files import EVALUATION, EVALUATION_FORMAT, EVALUATION_TRACES, EVALUATION_VERSION
 from droid_jax.read_json import read_json
 from droid_jax.report.identify_folder import ErrorsEntry
-from droid_jax.report.reading import Reader
+from droid_jax.report.reading import FindingEntry, Reader
 
 _READ = Reader("evaluate-fit")
 _KEYS = ("time", "measured_mean", "measured_low", "measured_high", "before", "after", "joints")
@@ -52,6 +52,7 @@ class EvaluationFile(Struct, frozen=True, kw_only=True):
     written: str = ""
     versions: dict[str, str] = field(default_factory=dict)
     device: str = ""
+    findings: list[FindingEntry] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.check_log import check_alone, check_log
+from droid_jax.preflight.torques import fitting_order
 from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
 
 REPEATS = 3
@@ -156,6 +157,56 @@ def test_columns_in_another_order(what: str):
     else:
         wrong = of_channel(what, lambda v: v[..., ::-1])(recording())
     assert [kind for kind, _ in found(wrong)] == ["order"]
+
+
+@pytest.mark.parametrize("what", ["torque", "position"])
+def test_columns_in_another_order_of_a_log_without_commands(what: str):
+    wrong = of_channel(what, lambda v: v[..., ::-1])(recording(commands=False, size=5 * SIZE))
+    (finding,) = check_log(scene(), wrong)
+    assert finding.kind == "order" and "exchanged" in finding.sentence
+
+
+def test_an_order_that_fits_better_is_named_of_three_joints():
+    """Joint i holds what was recorded as joint i + 1: no exchange of two mends that."""
+    left = {
+        "a": {"a": 0.9, "b": 0.02, "c": 0.8},
+        "b": {"a": 0.7, "b": 0.9, "c": 0.03},
+        "c": {"a": 0.01, "b": 0.9, "c": 1},
+    }
+    assert fitting_order(left) == {"a": "b", "b": "c", "c": "a"}
+
+
+@pytest.mark.parametrize("size", [1.0, 200.0])
+def test_a_load_register_for_a_torque(size: float):
+    """Of the other sign, and perhaps in per mille."""
+    register = of_channel("torque", lambda v: -size * v)(recording(size=5 * SIZE))
+    findings = check_log(scene(), register)
+    assert findings and all(f.kind == "sign" and "load register" in f.sentence for f in findings)
+    one = sign("torque", 1)(recording(size=5 * SIZE))
+    assert not any("load register" in f.sentence for f in check_log(scene(), one))
+
+
+@pytest.mark.parametrize("commands", [True, False])
+def test_a_recording_in_which_nothing_moves(commands: bool):
+    fine = recording(commands=commands)
+    still = {k: replace(c, values=c.values - c.values.mean(axis=0) + c.values[:, :1]) for k, c in fine.channels.items()}
+    wrong = replace(fine, channels=still, command=np.repeat(fine.command[:1], len(fine.command), axis=0))
+    (finding,) = [f for f in check_alone(wrong) if f.kind == "motion"]
+    assert finding.severity == "certain" and "nothing moves" in finding.sentence
+    moving = replace(wrong, channels=fine.channels)
+    assert not any(f.kind == "motion" for r in (fine, moving) for f in check_alone(r))
+
+
+def test_stamps_that_are_no_seconds_and_gaps_in_them():
+    fine = recording()
+    stretched = {k: replace(c, time=125.0 * c.time) for k, c in fine.channels.items()}  # milliseconds of 2 kHz
+    (finding,) = check_alone(replace(fine, channels=stretched, time=125.0 * fine.time))
+    assert (finding.kind, finding.severity) == ("clock", "certain") and "milliseconds" in finding.sentence
+    c = fine.channels["position"]
+    keep = np.abs(c.time - 6.0) > 0.05
+    silent = replace(c, time=c.time[keep], values=c.values[:, keep], mask=c.mask[:, keep])
+    (gap,) = check_alone(replace(fine, channels={**fine.channels, "position": silent}))
+    assert gap.severity == "note" and "'position' has a gap in time, the longest of 0.1 s at 5.9" in gap.sentence
 
 
 @pytest.mark.parametrize("gravcomp", [False, True])

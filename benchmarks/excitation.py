@@ -1,0 +1,206 @@
+"""Does a fit tell the parameters that `check --parameters` says it will, also those that its proposed motion adds?
+
+    python benchmarks/excitation.py [--quick] [--real DIR] [--out DIR]
+
+Poor motions of a two-link arm (one joint at rest, slow, small, quick), recorded in C MuJoCo on arms with other masses,
+damping, friction and armature.  Of each: what the check says of its nine parameters beside what a fit then finds; and
+the proposed motion, recorded on the same arm, and what a fit of both finds.  With --real DIR also the log of a real
+Panda (franka_gaz2019), beside the committed fit of experiments/real_panda.py, which is another program's path: its own
+filter and time blocks.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+# ruff: noqa: E402  (what is imported lies in a folder that is no package)
+from droid_jax import runtime
+
+runtime.tune()
+# isort: split
+
+import mujoco
+import numpy as np
+import tyro
+
+from benchmarks.check_cases import JOINTS, KP, RATE, measured, played, real, two_link
+from benchmarks.common import publish
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.additions import MotionProposal, propose
+from droid_jax.identify.excitation import Excitation, ExcitationConfig, excitation
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
+from droid_jax.identify.search import CmaConfig
+from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, model_parameter, servo_scale
+from droid_jax.model.joint_friction import joint_friction_space
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
+
+SECONDS = 8.0  # of a poor motion
+MOTIONS = ("shoulder alone", "elbow alone", "slow", "small", "quick and small", "both")
+FITS = IdentifyConfig(
+    search=CmaConfig(population=32, parents=None, generations=15),
+    refine=RefineConfig(basin_hops=0),
+    samples=0,
+    checks=False,
+)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Compare what the check says of parameters with what fits find.
+
+    real: folder of public logs.  quick: two motions of one arm.  out: folder of excitation.json.  seed: of the arms.
+    arms: each makes every motion.
+    """
+
+    real: Path | None = None
+    quick: bool = False
+    out: Path = ROOT / "benchmarks" / "results"
+    seed: int = 0
+    arms: int = 2
+
+
+def with_friction() -> Scene:
+    """The two-link arm with a friction loss that can be fitted."""
+    spec = two_link().spec.copy()
+    for joint in spec.joints:
+        joint.frictionloss = 0.02
+    return compile_scene(spec, "arm", joints=JOINTS)
+
+
+def space_of(scene: Scene) -> Space:
+    """Nine parameters of the arm."""
+    damping = [joint_damping(scene, j, std=1.0, high=20.0) for j in JOINTS]
+    friction = [joint_frictionloss(scene, j, std=0.2, high=5.0) for j in JOINTS]
+    rotor = [
+        model_parameter(scene, "dof_armature", j, name=f"armature[{j}]", unit="kg m^2", std=0.05, high=1.0)
+        for j in JOINTS
+    ]
+    return Space(
+        (*damping, *friction, *rotor, body_mass(scene, "fore", std=0.3, high=5.0), servo_scale(scene, "elbow", std=0.1))
+    )
+
+
+def arm(scene: Scene, seed: int) -> mujoco.MjModel:
+    """An arm with other numbers than the scene's."""
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(scene.spec.to_xml())
+    factors = rng.uniform(0.8, 1.4, 2)
+    model.body_mass[1:] *= factors
+    model.body_inertia[1:] *= factors[:, None]
+    model.dof_damping[:] *= rng.uniform(0.5, 1.5, 2)
+    model.dof_armature[:] *= rng.uniform(0.7, 1.4, 2)
+    model.dof_frictionloss[:] = rng.uniform(0.1, 0.5, 2)
+    model.opt.timestep = 1.0 / (4 * RATE)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def motion(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """[K] s and [K, 2] rad of commands."""
+    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    quick = 3.0 if kind.startswith("quick") else 0.3 if kind == "slow" else 1.0
+    size = 0.03 if "small" in kind else 0.4
+    waves = np.stack([np.sin(2 * np.pi * 0.35 * quick * time), np.sin(2 * np.pi * 0.55 * quick * time)], axis=1)
+    moving = np.array([kind != "elbow alone", kind != "shoulder alone"])
+    return time, np.array([0.2, -0.5]) + size * np.clip(time, 0, 1)[:, None] ** 2 * waves * moving
+
+
+def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.ndarray, seed: int) -> Recording:
+    """Two repeats without torques are few: one repeat of torques and positions, with noise."""
+    channels = measured(time, *played(model, command, command[0]), 1, np.random.default_rng(seed))
+    start: dict[str, float] = {str(j): float(q) for j, q in zip(JOINTS, command[0], strict=True)}
+    return Recording(
+        name, time, command, JOINTS, channels, TorqueConvention(TorqueSide.MOTOR, gravity=True), qpos0=start,
+        gains=ServoGains(KP, np.zeros(2)),
+    )  # fmt: skip
+
+
+def identifiable(scene: Scene, space: Space, recordings: Sequence[Recording]) -> dict[str, bool]:
+    """What a fit finds."""
+    found = identify_parameters(scene, space, recordings, config=FITS)
+    return {t.name: t.identifiable for t in found.identifiability}
+
+
+def said(found: Excitation) -> dict[str, bool]:
+    """What the check says."""
+    return {t.name: t.identifiable for t in found.told}
+
+
+def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
+    """One poor motion of one arm."""
+    model = arm(scene, seed)
+    log = recorded("poor", model, *motion(kind), seed)
+    found = excitation(scene, space, [log])
+    began = time.monotonic()
+    proposal: MotionProposal = propose(scene, space, found, log)
+    seconds = found.seconds + time.monotonic() - began
+    fit = identifiable(scene, space, [log])
+    row: dict[str, Any] = {"motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit}
+    if proposal.chosen:
+        clock, command = proposal.commands()
+        after = identifiable(scene, space, [log, recorded("added", model, clock, command, seed + 1)])
+        row |= {"added": [a.what for a in proposal.chosen], "added_s": proposal.seconds, "after": after}
+        row["told_by_it"] = list(proposal.opened)
+    return row
+
+
+def of_panda(folder: Path) -> dict[str, Any] | None:
+    """The Panda's log, its first two thirds, beside the committed fit."""
+    case = next((c for c in real(folder) if c.name == "panda/exciting"), None)
+    if case is None:
+        return None
+    fitted = json.loads((ROOT / "experiments" / "results" / "real_panda.json").read_text())
+    first, last = case.recording.span
+    log = case.recording.window(first, first + (last - first) * 2 / 3)
+    config = ExcitationConfig(compare=CompareConfig(motion_cutoff=8.0))
+    found = excitation(case.scene, joint_friction_space(case.scene.joints), [log], config)
+    names = {p["name"]: bool(p["identifiable"]) for p in fitted["models"]["friction"]["parameters"]}
+    return {"motion": "panda/exciting", "seconds": found.seconds, "said": said(found), "fit": names}
+
+
+def main(command: Compared) -> dict[str, Any]:
+    """All motions; returns what is published."""
+    scene = with_friction()
+    space = space_of(scene)
+    kinds, arms = (MOTIONS[:2], 1) if command.quick else (MOTIONS, command.arms)
+    rows = list[dict[str, Any]]()
+    for seed in range(command.seed, command.seed + arms):
+        for kind in kinds:
+            rows.append(of_arm(scene, space, kind, 10 * seed))
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    panda = of_panda(command.real) if command.real is not None else None
+    agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
+    added = [(row["after"][n]) for row in rows if "after" in row for n in row["told_by_it"]]
+    opened = [n for row in rows for n, known in row["said"].items() if not known]
+    result = {
+        "parameters_judged": len(agreeing),
+        "agreement": float(np.mean(agreeing)),
+        "open_before": len(opened),
+        "told_by_addition": len(added),
+        "addition_confirmed": float(np.mean(added)) if added else None,
+        "slowest_s": max(row["seconds"] for row in rows),
+        "motions": rows,
+    }
+    if panda is not None:
+        result["panda"] = panda
+        result["panda_agreement"] = float(np.mean([panda["said"][n] == panda["fit"][n] for n in panda["said"]]))
+    return result
+
+
+if __name__ == "__main__":
+    given = tyro.cli(Compared, description=__doc__)
+    outcome = main(given)
+    line = {key: value for key, value in outcome.items() if not isinstance(value, (list, dict))}
+    publish(given.out, "excitation", given.quick, given.seed, outcome, line)
