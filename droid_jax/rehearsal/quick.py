@@ -1,0 +1,576 @@
+"""The quick form: what would be found and recovered, from sensitivities alone, without a search.
+
+The search's own case is made of the recordings, or of what the replay and a stated noise make of their commands.
+Parameters stand where they are known; each candidate effect is simulated once with a small coefficient.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from droid_jax.cost.channels import SIMULATED
+from droid_jax.cost.cost import followed
+from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
+from droid_jax.discrepancy.case import Case, comparing
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, discretisation_error, refit
+from droid_jax.discrepancy.log_case import base_model
+from droid_jax.discrepancy.residual_set import ResidualSet
+from droid_jax.discrepancy.windowed_case import case_of
+from droid_jax.identify.gaussian import Gaussian
+from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
+from droid_jax.identify.multistart import RefineConfig, Refined
+from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effects.candidate import candidates
+from droid_jax.model.effects.registry import beside, joined, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.recordings.split import Split, roles_of, split_of
+from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
+from droid_jax.rehearsal.power import LinearModel, LinearPart, RehearsalConfig, rivals_of, smallest_sizes
+from droid_jax.simulate.compiled import compiled_replay
+
+AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
+RATE = 200.0  # Hz, of channels that nobody measured
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is rehearsed.
+
+    repeats: of each recording; None: as many as it holds.  noise: channel -> deviation of one sample, in its unit,
+    stated.  values: parameter -> value where it stands; others at their means.  channels: to compare; None: the
+    search's own choice.
+    simulated: replace what was measured by what the replay and the noise make of the commands.
+    """
+
+    repeats: int | None = None
+    noise: Mapping[str, float] | None = None
+    values: Mapping[str, float] | None = None
+    channels: tuple[str, ...] | None = None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether what was measured is replaced by what the replay and the noise make of the commands."""
+        return self.repeats is not None or self.noise is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """A linear model with what it came from.
+
+    model: of all channels that are known or assumed.  compared: those that the search compares.  refined: slopes of
+    the base parameters.  deviations: of the repeats.  noise: (channel, column, unit, deviation, source) of one sample.
+    """
+
+    split: Split
+    case: Case
+    roles: Mapping[str, Recording]
+    base: FittedModel
+    model: LinearModel
+    compared: tuple[str, ...]
+    noise: tuple[tuple[str, str, str, float, str], ...]
+    seconds: Mapping[str, float]
+
+
+def simulated_channels(
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    recording: Recording,
+    values: np.ndarray,
+    config: DiscrepancyConfig,
+) -> Rollout:
+    """What the replay makes of a recording's commands at values [D], without noise: one sample, host arrays [T, ...].
+
+    Its times count from the recording's first command.
+    """
+    drive = followed(scene, recording, config.compare)
+    replay = compiled_replay("mjx", scene, space, drive, effects)
+    rollout = jax.tree.map(lambda a: np.asarray(a)[0], replay(values[None]))
+    if not bool(rollout.finite):
+        raise ValueError(
+            f"the simulation of {recording.name!r} blows up at the parameters' values: begin at other ones, or shorten "
+            "the scene's time step"
+        )
+    return rollout
+
+
+def sample_noise(channel: Channel) -> np.ndarray:
+    """[C] deviation of a measured channel from row to row, as if it were white: of its second differences."""
+    second = np.diff(np.where(channel.mask, channel.values, np.nan), n=2, axis=1)
+    spread = np.nanmedian(np.abs(second).reshape(-1, second.shape[-1]), axis=0)
+    return 1.4826 * np.nan_to_num(spread) / np.sqrt(6.0)
+
+
+def scattered(channel: Channel) -> np.ndarray | None:
+    """[N, T, C] deviations of the repeats from their mean where all was measured; None of one repeat."""
+    if len(channel.values) < 2:
+        return None
+    values = np.where(channel.mask, channel.values, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # instants that nobody measured
+        return np.nan_to_num(values - np.nanmean(values, axis=0))
+
+
+def noisy(
+    clean: np.ndarray,
+    repeats: int,
+    deviation: np.ndarray,
+    apart: np.ndarray | None,
+    rng: np.random.Generator,
+    mix: np.ndarray,
+) -> np.ndarray:
+    """[N, T, C] a trace [T, C] with noise: what measured repeats [n, T, C] are apart, mixed anew, or white.
+
+    mix: [N, n] of normal numbers; the mixture has the covariance of the measured repeats.
+    """
+    if apart is not None:
+        return clean + np.einsum("nm,mtc->ntc", mix, apart) / np.sqrt(max(len(apart) - 1, 1))
+    return clean + deviation * rng.normal(size=(repeats, *clean.shape))
+
+
+def unit_of(scene: Scene, name: str, columns: Sequence[str]) -> str:
+    """Of a channel that nobody measured."""
+    if name == "torque":
+        return scene.torque_unit(columns)
+    return (
+        "/s or ".join(scene.position_unit(columns).split(" or ")) + "/s"
+        if name == "velocity"
+        else scene.position_unit(columns)
+    )
+
+
+def possible_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
+    """What a replay of a recording could be compared in."""
+    if not recording.command.size:
+        return ("torque",)
+    seen = scene.object_joint is not None and scene.object_joint not in scene.joints
+    return tuple(name for name in SIMULATED if name != "object_angle" or seen)
+
+
+def planned(
+    scene: Scene, recording: Recording, rollout: Rollout, plan: Plan, config: RehearsalConfig, seed: int
+) -> tuple[Recording, list[tuple[str, str, str, float, str]]]:
+    """A recording with every channel that a replay has, and the noise of each column.
+
+    What was measured stays, unless the plan says otherwise; what was not is simulated, with the noise that was stated,
+    measured or assumed.
+    """
+    rng = np.random.default_rng([seed, 11])
+    repeats = plan.repeats or recording.repeats
+    measured = [n for n in recording.channels if n in SIMULATED]
+    most = max((recording.channels[n].values.shape[0] for n in measured), default=1)
+    mix = rng.normal(size=(repeats, most))
+    channels, noise = dict[str, Channel](), list[tuple[str, str, str, float, str]]()
+    for name in possible_channels(scene, recording):
+        known = recording.channels.get(name)
+        stated = (plan.noise or {}).get(name)
+        apart = None if known is None or stated is not None else scattered(known)
+        if known is not None and not plan.simulated:
+            channels[name] = known
+            source = "repeats" if known.values.shape[0] > 1 else "log"
+            deviation = apart.std(axis=(0, 1)) if apart is not None else sample_noise(known)
+            noise += [(name, c, known.unit, float(d), source) for c, d in zip(known.columns, deviation, strict=True)]
+            continue
+        trace = getattr(rollout, name)
+        trace = trace[:, None] if trace.ndim == 1 else trace
+        if known is not None:
+            columns, time = known.columns, known.time
+        else:
+            columns = (str(scene.object_joint),) if name == "object_angle" else scene.joints
+            time = recording.time[0] + np.arange(0.0, float(rollout.time[-1]), 1.0 / RATE)
+        index = [0] if name == "object_angle" else [scene.joints.index(c) for c in columns if c in scene.joints]
+        columns = columns if name == "object_angle" else tuple(scene.joints[i] for i in index)
+        clean = interpolate(time, recording.time[0] + rollout.time, np.asarray(trace, float)[:, index])
+        if stated is not None:
+            deviation, source = np.full(len(columns), stated), "stated"
+        elif apart is not None and known is not None and len(columns) == len(known.columns):
+            deviation, source = apart.std(axis=(0, 1)) * np.sqrt(len(apart) / (len(apart) - 1)), "repeats"
+        else:
+            apart = None
+            deviation, source = np.full(len(columns), config.noise[name]), "assumed"
+        values = noisy(clean, repeats, deviation, apart, rng, mix)
+        unit = known.unit if known is not None else unit_of(scene, name, columns)
+        channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
+        noise += [(name, c, unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
+    others = {} if plan.simulated else {k: c for k, c in recording.channels.items() if k not in channels}
+    return replace(recording, channels={**channels, **others}), noise
+
+
+def rehearsed(
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    plan: Plan,
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+    tell: Tell = lambda stage: None,
+    *,
+    step_error: bool = True,
+) -> Rehearsed:
+    """The linear model of a search in these recordings.
+
+    Args:
+        scene: the robot.
+        space: all that is fitted without any effect.
+        effects: that could be hidden.
+        recordings: as given to the search.
+        plan: what is planned beside what was measured.
+        config: of the search.
+        rehearsal: what is assumed.
+        tell: called with each stage's name.
+        step_error: whether to measure what the time step leaves, which takes another compilation.
+
+    Raises:
+        ValueError: what the search refuses too, or a simulation that blows up.
+    """
+    clock = _Stopwatch(tell)
+    clock("compile")
+    scene, effects = ready(scene), beside(space, effects)
+    start = space.values(dict(plan.values or {}))
+    whole = joined(space, effects)
+    at = whole.embed(space, start[None])[0]
+    commanded = all(r.command.size for r in recordings)
+    config = replace(config, channels=plan.channels or config.channels)
+    noise = list[tuple[str, str, str, float, str]]()
+    made = list[Recording]()
+    if not commanded and plan.simulated:
+        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
+    for i, recording in enumerate(recordings):
+        if not commanded:
+            made.append(recording)
+            continue
+        rollout = simulated_channels(scene, whole, effects, recording, at, config)
+        full, each = planned(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        made.append(full)
+        noise = noise or each
+    chosen = _compared(scene, recordings, made, plan, config)
+    split = split_of(made)
+    roles = roles_of(split, made)
+    every = _alike(made) if commanded and split is not Split.WINDOWS else chosen
+    clock("case")
+    needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
+    case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
+    values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
+    clock("base")
+    if split is Split.BLOCKS:
+        base = base_model(case)
+        values = base.values
+    else:
+        base = refit(case.train, case.base, (), values[None], AT_REST)
+    clock("sensitivities")
+    directions = directions_of(candidates(case.effects))
+    train = part_of(case.train, base, directions)
+    if split is Split.REPEATS:
+        validation = train
+    else:
+        beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
+        validation = part_of(case.validation, beside_base, directions, base.refined.free)
+    error = 0.0
+    if step_error and split is not Split.BLOCKS:
+        clock("step error")
+        try:
+            error = discretisation_error(case.train, base, roles["train"])
+        except NotReplayed:
+            error = 0.0
+    clock("")
+    model = linear_model(case, base, directions, train, validation, error)
+    return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
+
+
+def _compared(
+    scene: Scene, given: Sequence[Recording], made: Sequence[Recording], plan: Plan, config: DiscrepancyConfig
+) -> tuple[str, ...]:
+    """The channels that the search would compare: those asked for, else of what is measured."""
+    if config.channels:
+        return tuple(n for n in SIMULATED if n in config.channels)
+    if plan.noise:  # what is stated is what will be measured
+        named = [n for n in SIMULATED if n in plan.noise and all(n in r.channels for r in made)]
+        if named:
+            kept = [replace(r, channels={n: r.channels[n] for n in named}) for r in made]
+            return tuple(comparing(scene, kept, config).compare.channels)
+    return tuple(comparing(scene, given, config).compare.channels)
+
+
+def _alike(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Channels that all of them have."""
+    return tuple(n for n in SIMULATED if all(n in r.channels for r in recordings))
+
+
+def part_of(
+    residual_set: ResidualSet, base: FittedModel, directions: Sequence[ScoreDirection], free: np.ndarray | None = None
+) -> LinearPart:
+    """A part of the recordings in the linear model, at the values of `base`."""
+    free = base.refined.free if free is None else free
+    root = residual_set.repeats**0.5
+    names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
+    channel = np.array(names)[residual_set.column]
+    raw = sensitivities(residual_set, base.values, directions)
+    level = 0.0 if residual_set.resampling.repeated else base.discrepancy
+    return LinearPart(raw, base.refined.jacobian[:, free] / root, residual_set.resampling, channel, level)
+
+
+def linear_model(
+    case: Case,
+    base: FittedModel,
+    directions: Sequence[ScoreDirection],
+    train: LinearPart,
+    validation: LinearPart,
+    step_error: float,
+) -> LinearModel:
+    """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
+    space, minimum = case.full_space, case.minimum_sizes
+    of = [space[d.coefficient] for d in directions]
+    return LinearModel(
+        directions=tuple(directions),
+        train=replace(train, raw=np.nan_to_num(train.raw)),
+        validation=replace(validation, raw=np.nan_to_num(validation.raw)),
+        prior=base.refined.prior[base.refined.free],
+        slack=case.train.prior_slack,
+        repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
+        step_error=step_error,
+        minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
+        low=np.array([p.low - p.mean for p in of]),
+        high=np.array([p.high - p.mean for p in of]),
+    )
+
+
+def hidden_directions(model: LinearModel) -> list[int]:
+    """Of each coefficient at each place one direction: in the middle of the shapes that are tried."""
+    groups: dict[str, list[int]] = {}
+    for k, direction in enumerate(model.directions):
+        groups.setdefault(direction.coefficient, []).append(k)
+    return [rows[len(rows) // 2] for rows in groups.values()]
+
+
+def told_parameters(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
+    """What the recordings would say of each base parameter; more: times as many of them."""
+    refined, train = found.base.refined, found.case.train
+    seen = np.isin(found.model.train.channel, np.unique(model.train.channel))
+    if not found.model.repeated:  # the validation blocks are fitted by `identify` too
+        more = 2 * more
+    jacobian = refined.jacobian[seen] * np.sqrt(more * model.repeats / max(found.model.repeats, 1))
+    part = replace(refined, jacobian=jacobian, residual=refined.residual[seen])
+    gaussian = with_stated_prior(_posterior(part, model, train), part)
+    return identifiability(gaussian, part.prior, train.identifiability)
+
+
+def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaussian:
+    rows = model.train.rows
+    deviations = [rows.deviations] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
+    return calibrated(refined, deviations, None, train.identifiability.pooling)
+
+
+def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalConfig) -> list[dict[str, Any]]:
+    """Of each coefficient at each place: the smallest size that is found, and what it is taken for."""
+    model, space = found.model.of(found.compared), found.case.full_space
+    wanted = hidden_directions(model)
+    out = []
+    for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config.selection), strict=True):
+        direction, p = model.directions[k], space[model.directions[k].coefficient]
+        rivals = rivals_of(model, k, size.size, config, rehearsal.share)
+        out.append(
+            {
+                "effect": direction.candidate.effect,
+                "location": direction.candidate.location,
+                "coefficient": direction.coefficient,
+                "unit": p.unit,
+                "shape": dict(direction.candidate.shape_parameters),
+                "smallest": size.size,
+                "limit": size.limit,
+                "score_test": size.score,
+                "validation": size.gain,
+                "minimum": float(model.minimum[k]),
+                "bound": float(model.room[k]),
+                "noncentrality": size.noncentrality,
+                "taken_for": [
+                    {"effect": r.key.effect, "location": r.key.location, "share": r.share, "below": r.apart}
+                    for r in rivals
+                ],
+            }
+        )
+    return out
+
+
+def improvements(
+    found: Rehearsed,
+    known: Sequence[Mapping[str, Any]],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+    faster: Rehearsed | None = None,
+) -> list[dict[str, Any]]:
+    """What more repeats, another channel or another motion would change, the most helpful first."""
+    model = found.model.of(found.compared)
+    wanted = hidden_directions(model)
+    before = np.array([e["smallest"] for e in known])
+    recovered = _recovered(found, model, rehearsal)
+    out = []
+    for what, other, more, source in _variants(found, faster):
+        if source is found and not other.repeated and more > 1:
+            after, told = before / np.sqrt(more), _recovered(found, other, rehearsal, more)
+        else:
+            sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
+            after, told = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
+        both = np.isfinite(before) & np.isfinite(after)
+        ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
+        out.append(
+            {
+                "what": what,
+                "times_smaller": ratio,
+                "newly_found": int(np.sum(~np.isfinite(before) & np.isfinite(after))),
+                "lost": int(np.sum(np.isfinite(before) & ~np.isfinite(after))),
+                "recovered_more": told - recovered,
+            }
+        )
+    return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
+
+
+def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
+    model = found.model.of(found.compared)
+    for factor in (2, 4):
+        if model.repeated:
+            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0, found
+        else:
+            yield f"a log {factor} times as long", model, float(factor), found
+    for name in dict.fromkeys(found.model.train.channel.tolist()):
+        if name not in found.compared:
+            what = name.replace("_", " ")
+            yield f"{what} compared too", found.model.of((*found.compared, name)), 1.0, found
+    if faster is not None:
+        yield "the faster motion", faster.model.of(found.compared), 1.0, faster
+
+
+def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
+    told = told_parameters(found, model, more)
+    limit = rehearsal.recovered or found.case.train.identifiability.identifiable
+    nuisance = dict(zip(found.base.space.names, found.base.space.nuisance, strict=True))
+    return sum(t.shrinkage < limit for t in told if not nuisance[t.name])
+
+
+def faster_motion(recording: Recording, factor: float) -> Recording:
+    """A commanded recording whose motion is made faster and then stands still, as long as before."""
+
+    def clock(new: np.ndarray, duration: float) -> np.ndarray:
+        return np.minimum(factor * new, duration)
+
+    return time_scaled(recording, TimeScaling(f"{recording.name}, {factor:g} times as fast", lambda d: d, clock))
+
+
+def quick_rehearsal(
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    plan: Plan | None = None,
+    config: DiscrepancyConfig | None = None,
+    rehearsal: RehearsalConfig | None = None,
+    tell: Tell = lambda stage: None,
+    *,
+    faster: bool = True,
+) -> dict[str, Any]:
+    """What a search in these recordings would find, as plain data (rehearsal.json).
+
+    Args:
+        scene: the robot.
+        space: all that is fitted without any effect.
+        effects: that could be hidden.
+        recordings: as given to the search.
+        plan: repeats, noise, channels and parameter values that are stated; None: as measured.
+        config: of the search.
+        rehearsal: what counts as found.
+        tell: called with each stage's name.
+        faster: whether a faster motion is looked at too.
+
+    Raises:
+        ValueError: what the search refuses too, or a simulation that blows up.
+    """
+    began = time.monotonic()
+    plan, config = plan or Plan(), config or DiscrepancyConfig()
+    rehearsal = rehearsal or RehearsalConfig()
+    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell)
+    tell("tests")
+    known = answers(found, config, rehearsal)
+    model = found.model.of(found.compared)
+    other = None
+    if faster and found.model.repeated and all(r.command.size for r in recordings):
+        moved = [faster_motion(r, rehearsal.faster) for r in recordings]
+        other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
+        try:
+            other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
+        except ValueError as error:
+            warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
+    tell("improvements")
+    helps = improvements(found, known, config, rehearsal, other)
+    limit = rehearsal.recovered or config.identifiability.identifiable
+    told = told_parameters(found, model)
+    of = {p.name: p for p in found.base.space.parameters}
+    at = dict(zip(found.case.full_space.names, found.base.values, strict=True))
+    return {
+        "format": "droid_jax rehearsal 1",
+        "form": "quick",
+        "recordings": [r.name for r in recordings],
+        "split": found.split.value,
+        "limits": [*filter(None, (found.split.limits, *found.case.limits))],
+        "how": {
+            "compared": list(found.compared),
+            "repeats": found.model.repeats if found.model.repeated else None,
+            "blocks": None if found.model.repeated else found.model.train.rows.units,
+            "simulated": plan.simulated,
+            "noise": [
+                dict(zip(("channel", "column", "unit", "deviation", "source"), row, strict=True))
+                for row in found.noise
+                if row[0] in found.compared
+            ],
+            "step_error": found.model.step_error,
+            "level": model.train.level,
+            "directions": len(model.directions),
+            "rehearsal": asdict(rehearsal),
+            "significance": config.selection.significance,
+            "confirmation": config.selection.confirmation,
+            "recovered_below": limit,
+        },
+        "parameters": [
+            {
+                "name": t.name,
+                "unit": of[t.name].unit,
+                "value": float(at[t.name]),
+                "nuisance": bool(of[t.name].nuisance),
+                "shrinkage": t.shrinkage,
+                "recovered": bool(t.shrinkage < limit),
+                "partners": [list(p) for p in t.partners],
+            }
+            for t in told
+        ],
+        "effects": known,
+        "helps": helps,
+        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began},
+    }
+
+
+class _Stopwatch:
+    """Seconds of each stage."""
+
+    def __init__(self, tell: Tell) -> None:
+        self.tell, self.seconds = tell, dict[str, float]()
+        self._stage, self._since = "", time.monotonic()
+
+    def __call__(self, stage: str) -> None:
+        now = time.monotonic()
+        if self._stage:
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._stage, self._since = stage, now
+        if stage:
+            self.tell(stage)
