@@ -38,6 +38,7 @@ from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
 from droid_jax.rehearsal.power import LinearModel, LinearPart, RehearsalConfig, rivals_of, smallest_sizes
+from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
@@ -98,7 +99,7 @@ def simulated_channels(
     """
     drive = followed(scene, recording, config.compare)
     replay = compiled_replay("mjx", scene, space, drive, effects)
-    rollout = jax.tree.map(lambda a: np.asarray(a)[0], replay(values[None]))
+    rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
     if not bool(rollout.finite):
         raise ValueError(
             f"the simulation of {recording.name!r} blows up at the parameters' values: begin at other ones, or shorten "
@@ -209,6 +210,16 @@ def planned(
     return replace(recording, channels={**channels, **others}), noise
 
 
+def _of_log(recording: Recording) -> list[tuple[str, str, str, float, str]]:
+    """The noise of a log whose windows or blocks stand for repeats: what fits leave of it counts, and this beside."""
+    return [
+        (name, column, channel.unit, float(deviation), "log, from row to row")
+        for name, channel in recording.channels.items()
+        if name in SIMULATED
+        for column, deviation in zip(channel.columns, sample_noise(channel), strict=True)
+    ]
+
+
 def rehearsed(
     scene: Scene,
     space: Space,
@@ -249,12 +260,13 @@ def rehearsed(
     made = list[Recording]()
     if not commanded and plan.simulated:
         raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
+    as_measured = not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS)
     for i, recording in enumerate(recordings):
-        if not commanded:
-            made.append(recording)
-            continue
-        rollout = simulated_channels(scene, whole, effects, recording, at, config)
-        full, each = planned(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        if as_measured:
+            full, each = recording, _of_log(recording)
+        else:
+            rollout = simulated_channels(scene, whole, effects, recording, at, config)
+            full, each = planned(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
         made.append(full)
         noise = noise or each
     chosen = _compared(scene, recordings, made, plan, config)
