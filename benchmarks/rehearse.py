@@ -38,8 +38,8 @@ from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
-from droid_jax.rehearsal.power import RehearsalConfig  # noqa: E402
-from droid_jax.rehearsal.quick import Plan, quick_rehearsal  # noqa: E402
+from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
+from droid_jax.rehearsal.quick import Plan, quick_rehearsal, rehearsed  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record  # noqa: E402
 from experiments.blind.scenes import ROLES as ROLES_THERE  # noqa: E402
 from experiments.blind.scenes import Setting, setting  # noqa: E402
@@ -119,11 +119,10 @@ def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], Full
 
     quick = kept(runs / f"quick_{name}_seed{seed}.json", made)
     identify = IdentifyConfig(search=search_config("quick", seed), refine=refine_config("quick"), samples=0)
-    known = where.base.values({p["name"]: p["value"] for p in quick["parameters"]})
-    of = FullRehearsal(
-        where.scene, where.base, effects, tuple(recordings), plan, config, identify, rehearsal, known, CHANNELS, seed
+    found = rehearsed(where.scene, where.base, effects, recordings, plan, config, rehearsal, step_error=False)
+    return quick, FullRehearsal(
+        where.scene, where.base, effects, tuple(recordings), plan, config, identify, rehearsal, found, seed
     )
-    return quick, of
 
 
 def asked(quick: Mapping[str, Any], of: FullRehearsal) -> list[dict[str, Any]]:

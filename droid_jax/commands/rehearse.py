@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.rehearsal.power import RehearsalConfig
+    from droid_jax.rehearsal.linear import RehearsalConfig
     from droid_jax.rehearsal.quick import Plan
 
 DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
@@ -99,7 +99,7 @@ def run(command: Rehearse) -> None:
     runtime.start()
     if command.full:
         warn_of_cpu(command.preset)
-    from droid_jax.rehearsal.power import RehearsalConfig
+    from droid_jax.rehearsal.linear import RehearsalConfig
     from droid_jax.rehearsal.quick import quick_rehearsal
     from droid_jax.storage import refuse_special, write_own
 
@@ -198,16 +198,17 @@ def _full(
     """The complete rehearsals and their scores."""
     from droid_jax.identify.pipeline import IdentifyConfig
     from droid_jax.rehearsal.full import FullRehearsal, hidden_cases, run_cases, scores
+    from droid_jax.rehearsal.quick import rehearsed
 
     if not all(r.command.size for r in recordings):
         raise ValueError("--full needs recordings with commands: a log without them prescribes its motion")
-    known = base.values({p["name"]: p["value"] for p in quick["parameters"]})
+    found = rehearsed(scene, base, effects, recordings, plan, config, rehearsal, step_error=False)
     identify = IdentifyConfig(
         search=search_config(command.preset, command.seed), refine=refine_config(command.preset), samples=0
     )
     of = FullRehearsal(
-        scene, base, tuple(effects), tuple(recordings), plan, config, identify, rehearsal, known,
-        tuple(quick["how"]["compared"]), command.seed,
+        scene, base, tuple(effects), tuple(recordings), plan, config, identify, rehearsal, found,
+        command.seed,
     )  # fmt: skip
     decides = {k: v for k, v in setup.items() if k != "full"}
     name = hashlib.sha256(json.dumps(plain(decides), sort_keys=True).encode()).hexdigest()[:12]

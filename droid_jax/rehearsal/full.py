@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.cost import followed
+from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.missing import search
 from droid_jax.discrepancy.windowed_case import case_of
@@ -28,10 +29,11 @@ from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json
+from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
-from droid_jax.rehearsal.power import RehearsalConfig
-from droid_jax.rehearsal.quick import Plan, planned, simulated_channels
+from droid_jax.rehearsal.linear import RehearsalConfig
+from droid_jax.rehearsal.quick import Plan, Rehearsed, hidden_directions, planned, simulated_channels
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.servo_gains import scale_gains, servo_factors
 from droid_jax.storage import write_json
@@ -44,6 +46,7 @@ LEVEL = 0.9  # of the intervals that are judged
 TIMES = (1.0, 0.5, 2.0)  # of the size that the quick form predicts, in turns
 EMPTY = 5  # one case of so many has nothing hidden
 RATE = 1000.0  # Hz, of what the synthetic robot hands on before it is put onto the recording's clocks
+FARTHEST = 10.0  # times the library's size that an amplitude is taken to be, and the other way round
 RESULT = "result.json"
 
 
@@ -51,8 +54,10 @@ RESULT = "result.json"
 class HiddenCase:
     """One rehearsal: nothing hidden (effect ""), or an effect at a place, of some size of one coefficient.
 
+    size: of the library's coefficient.  times: of the size that the quick form predicts.
     hidden: how the synthetic robot calls it; empty where the library's own law is simulated.
-    times: of the size that the quick form predicts.
+    amplitude: of the synthetic robot's law, as strong in this motion as `size` (`equally_strong`).
+    form: share of what that law leaves that the library's form could take.
     """
 
     number: int
@@ -64,6 +69,8 @@ class HiddenCase:
     times: float = 0.0
     hidden: str = ""
     joint: str = ""
+    amplitude: float = 0.0
+    form: float = 1.0
 
     @property
     def name(self) -> str:
@@ -92,7 +99,7 @@ def hidden_form(scene: Scene, effect: str, location: str, unit: str) -> tuple[st
     return "", ""
 
 
-def cases_of(
+def hidden_cases(
     scene: Scene, known: Sequence[Mapping[str, Any]], count: int, times: Sequence[float] = TIMES
 ) -> list[HiddenCase]:
     """N cases: every fifth with nothing hidden, the others go through the effects at the predicted sizes in turns.
@@ -116,9 +123,8 @@ def hidden_case(scene: Scene, number: int, entry: Mapping[str, Any], times: floa
     """One effect of a quick rehearsal, at some times its predicted size."""
     name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
     size = times * min(float(entry["smallest"]), float(entry["bound"]) / max(times, 1.0))
-    return HiddenCase(
-        number, entry["effect"], entry["location"], entry["coefficient"], dict(entry["shape"]), size, times, name, joint
-    )
+    where = (entry["effect"], entry["location"], entry["coefficient"], dict(entry["shape"]))
+    return HiddenCase(number, *where, size, times, name, joint, size)
 
 
 def drawn_values(space: Space, known: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -182,7 +188,7 @@ def _robot_trace(
     assert isinstance(drive, Drive)
     robot = replace(scene, model=scale_gains(copy.copy(scene.model), servo_factors(scene, drive)))
     start = {**recording.measured_start(), **recording.qpos0}
-    hidden = [Applied(case.hidden, case.size, case.joint)] if case.hidden else []
+    hidden = [Applied(case.hidden, case.amplitude, case.joint)] if case.hidden else []
     truth = {name: float(v) for name, v in zip(space.names, values, strict=True)}
     log = record_hidden(
         robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=quiet, space=space
@@ -204,11 +210,51 @@ def _robot_trace(
     )
 
 
+def equally_strong(
+    found: Rehearsed, space: Space, recording: Recording, case: HiddenCase, config: DiscrepancyConfig
+) -> HiddenCase:
+    """A case whose amplitude makes the synthetic robot's law as strong in the score test as the library's size.
+
+    Two laws of one effect count their sizes differently: friction one way is as much both ways, and half of it as a
+    difference.  Unchanged where windows or blocks take the place of repeats.
+    """
+    if not case.hidden or not found.model.repeated:
+        return case
+    model, comparison, scene = found.model, found.case.train.comparison, found.case.train.cost.scene
+    known = found.base.values[found.case.full_space.columns(space)]
+
+    def whitened(of: HiddenCase) -> np.ndarray:
+        trace = _robot_trace(scene, space, recording, known, of, config, 0)
+        clock = comparison.clock - comparison.clock[0]
+        fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
+        angle = np.interp(clock, trace.time, trace.object_angle)
+        on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
+        return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
+
+    seen = np.isin(model.train.channel, found.compared)
+    part = model.of(found.compared)
+    left = project((whitened(case) - whitened(HiddenCase(0)))[None, seen], part.train.base, part.held(part.slack))[0]
+    sensitivities, best = part.projected(), 0.0
+    groups: dict[object, list[int]] = {}
+    for k, direction in enumerate(part.directions):
+        if (direction.candidate.effect, direction.candidate.location) == (case.effect, case.location):
+            groups.setdefault(direction.candidate.shaped_key, []).append(k)
+    for rows in groups.values():
+        span, _ = np.linalg.qr(sensitivities[rows].T)
+        best = max(best, float(np.linalg.norm(span.T @ left)))
+    own = [k for k in hidden_directions(part) if part.directions[k].coefficient == case.coefficient]
+    if not own or best <= 0 or not np.isfinite(best):
+        return case
+    factor = case.size * float(np.linalg.norm(sensitivities[own[0]])) / best
+    share = best**2 / max(float(left @ left), 1e-30)
+    return replace(case, amplitude=case.size * float(np.clip(factor, 1 / FARTHEST, FARTHEST)), form=share)
+
+
 @dataclass(frozen=True, eq=False)
 class FullRehearsal:
     """What all cases share.
 
-    known: [D] where the parameters stand.  identify: settings of the identification of cases with nothing hidden.
+    identify: settings of the identification of cases with nothing hidden.  found: the linear model that sizes are of.
     """
 
     scene: Scene
@@ -219,9 +265,18 @@ class FullRehearsal:
     config: DiscrepancyConfig
     identify: IdentifyConfig
     rehearsal: RehearsalConfig
-    known: np.ndarray
-    channels: tuple[str, ...]
+    found: Rehearsed
     seed: int = 0
+
+    @property
+    def known(self) -> np.ndarray:
+        """[D] where the parameters stand."""
+        return self.found.base.values[self.found.case.full_space.columns(self.space)]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Those that are compared."""
+        return self.found.compared
 
 
 def run_case(of: FullRehearsal, case: HiddenCase, folder: Path) -> dict[str, Any]:
@@ -233,6 +288,7 @@ def run_case(of: FullRehearsal, case: HiddenCase, folder: Path) -> dict[str, Any
     if path.is_file():
         return dict(read_json(path))
     began = time.monotonic()
+    case = equally_strong(of.found, of.space, of.recordings[0], case, of.config)
     result: dict[str, Any] = {**asdict(case), "same_law": bool(case.effect and not case.hidden)}
     try:
         result |= _rehearse(of, case, folder / case.name / "replays")

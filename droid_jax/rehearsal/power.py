@@ -1,173 +1,39 @@
-"""Which size of an effect the search's own tests find, in a model that is linear in parameters and effects.
+"""Which size of an effect the search's own tests find, in a linear model.
 
 The score test and the validation test of the search are made on drawn noise, with its own sign flips, thresholds and
-block structure.  Only the replays are left out: an effect adds its sensitivity times its size to the residual, and the
-base parameters absorb what they can of it.  Whitened noise has a deviation of one in each repeat.
+block structure.  Only the replays are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.stats
-from scipy.optimize import lsq_linear
 
-from droid_jax.arguments import check_fields, number, weights, whole
-from droid_jax.discrepancy.candidates import ScoreDirection, project
-from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
+from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import WORST
-from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, detrended, sign_flips, t_values
-from droid_jax.model.effects.candidate import EffectKey
-from droid_jax.recordings.split import FEWEST_REPEATS
+from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
+from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, unhindered
 
 LEAST, MOST = 1.5, 80.0  # noncentralities between which the smallest size is looked for
 HALVINGS = 8
 CHUNK = 4e6  # numbers of a batch of flips
 
 
-def _assumed() -> dict[str, float]:
-    return {"torque": 0.05, "position": 1e-4, "velocity": 0.01, "object_angle": 0.0035}
-
-
-@dataclass(frozen=True)
-class RehearsalConfig:
-    """What counts as found, and what is assumed where nothing was measured.
-
-    share: of rehearsals in which an effect must be found.
-    draws: of noise, over which that share is taken.
-    flips: sign flips of a score test at most; the search itself makes up to 4096.
-    close: absolute cosine of two sensitivities from which one stands for both in the largest statistic.
-    recovered: posterior deviation over prior deviation up to which a parameter counts as recovered; None: that of
-      `IdentifiabilityConfig`.
-    pooling: degrees of freedom with which the scatter of all directions counts in each one's own.
-    noise: channel -> deviation of one sample, in its unit, where it was neither measured nor stated; torque,
-      position and camera are those of a Panda.
-    faster: how many times as fast the other motion is.
-    seed: of the draws.
-    """
-
-    share: float = 0.9
-    draws: int = 48
-    flips: int = 512
-    close: float = 0.97
-    recovered: float | None = None
-    pooling: float = 12.0
-    noise: dict[str, float] = field(default_factory=_assumed)
-    faster: float = 1.5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            share=partial(number, above=0, below=1),
-            draws=partial(whole, least=8),
-            flips=partial(whole, least=100),
-            close=partial(number, above=0, most=1),
-            pooling=partial(number, above=0),
-            noise=weights,
-            faster=partial(number, above=0),
-            seed=partial(whole, least=0),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class LinearPart:
-    """One part of the recordings (training or validation) in a linear model.
-
-    raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat.  base: [M, D] what a search unit of
-    each base parameter adds.  rows: what is resampled.  channel: [M] name of the channel of each residual.
-    level: mean square of the residual where nothing is missing, of rows that are blocks.
-    """
-
-    raw: np.ndarray
-    base: np.ndarray
-    rows: Resampling
-    channel: np.ndarray
-    level: float = 0.0
-
-    def of(self, channels: Sequence[str]) -> LinearPart:
-        """The same of some channels."""
-        kept = np.isin(self.channel, channels)
-        rows = (
-            Repeats(self.rows.deviations[:, kept]) if isinstance(self.rows, Repeats) else Blocks(self.rows.block[kept])  # type: ignore[attr-defined]
-        )
-        return replace(self, raw=self.raw[:, kept], base=self.base[kept], rows=rows, channel=self.channel[kept])
-
-
-@dataclass(frozen=True, eq=False)
-class LinearModel:
-    """A linear model of a search.
-
-    directions: K coefficients.  train, validation: parts.  prior: [D] deviations of the base parameters' priors in a
-    fit, search units.  slack: times these that the score test lets parameters move.  repeats: N that are rehearsed; of
-    blocks how many times the recording's own length, times its blocks.
-    step_error: U0.  minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
-    """
-
-    directions: tuple[ScoreDirection, ...]
-    train: LinearPart
-    validation: LinearPart
-    prior: np.ndarray
-    slack: float
-    repeats: int
-    step_error: float
-    minimum: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    @property
-    def room(self) -> np.ndarray:
-        """[K] largest size of each coefficient: upwards, or downwards where neutral is the upper bound."""
-        return np.where(self.high > 0, self.high, -self.low)
-
-    @property
-    def sign(self) -> np.ndarray:
-        """[K] direction that a size counts in."""
-        return np.where(self.high > 0, 1.0, -1.0)
-
-    @property
-    def repeated(self) -> bool:
-        """Whether rows are repeats."""
-        return self.train.rows.repeated
-
-    def of(self, channels: Sequence[str]) -> LinearModel:
-        """The same with some channels compared."""
-        return replace(self, train=self.train.of(channels), validation=self.validation.of(channels))
-
-    def projected(self) -> np.ndarray:
-        """[K, M] sensitivities of the training part, as the score test has them."""
-        return project(self.train.raw, self.train.base, self._held(self.slack))
-
-    def unabsorbed(self) -> np.ndarray:
-        """[K, M] what a unit adds to the validation part once the base is fitted to the training part."""
-        base, held = self.train.base, self._held(1.0)
-        normal = base.T @ base + np.diag(held**-2)
-        absorbed = np.linalg.solve(normal, base.T @ self.train.raw.T)  # [D, K]
-        return self.validation.raw - (self.validation.base @ absorbed).T
-
-    def _held(self, slack: float) -> np.ndarray:
-        """[D] prior deviations beside the residual of one repeat, or of the whole log."""
-        return self.prior * slack * (self.repeats**0.5 if self.repeated else 1.0)
-
-
 @dataclass(frozen=True)
 class Smallest:
     """The smallest size of one coefficient that is found often enough.
 
-    size: in the coefficient's unit; inf where none within its bounds is.  score, gain, minimum, step: what each
-    condition alone asks for; noncentrality: of `size` in the score test.  limit: which of them decides.
+    size: in the coefficient's unit; inf where none within its bounds is.  limits: what each condition alone asks for.
+    limit: the one that decides.  noncentrality: of `size` in the score test.
     """
 
     size: float
-    score: float
-    gain: float
-    minimum: float
-    step: float
-    noncentrality: float
+    limits: Mapping[str, float]
     limit: str
+    noncentrality: float
 
 
 def smallest_sizes(
@@ -183,28 +49,52 @@ def smallest_sizes(
     """
     selection = selection or SelectionConfig()
     scores, gains = score_draws(model, config), gain_draws(model, config)
-    projected, size = scores.projected, np.linalg.norm(scores.projected, axis=1)
+    size = np.linalg.norm(scores.projected, axis=1)
     units = model.repeats**0.5 if model.repeated else 1.0
-    share = float(model.train.rows.counted.sum()) * WORST * model.step_error
     out = []
     for k in wanted:
         strength = float(size[k]) * units  # noncentrality of a unit
-        if strength < 1e-12 or not np.isfinite(projected[k]).all():
-            out.append(Smallest(np.inf, np.inf, np.inf, float(model.minimum[k]), np.inf, np.nan, "no signal"))
+        if strength < 1e-12:
+            out.append(Smallest(np.inf, {}, "no signal", np.nan))
             continue
-        by_score = scores.crossings(k, selection.significance) / strength
-        by_gain = gains.crossings(k, selection)
         spread = max(float(scipy.stats.norm.ppf(config.share)), 0.0) / strength  # of the fitted size
-        least, step = float(model.minimum[k]) + spread, float(np.sqrt(share) / size[k])
-        each = np.maximum(np.maximum(by_score, by_gain), max(least, step))
-        found = float(np.quantile(each, config.share, method="higher"))
-        alone = {name: float(np.quantile(a, config.share, method="higher")) for name, a in
-                 (("score test", by_score), ("validation", by_gain))}  # fmt: skip
-        limits = {**alone, "minimum effect size": least, "time step": step}
-        limit = max(limits, key=lambda name: limits[name])
+        drawn = {
+            "score test": scores.crossings(k, selection.significance) / strength,
+            "validation": gains.crossings(k, selection),
+            "time step": discrepancy_crossings(model, k, strength, gains, config),
+        }
+        fixed = {
+            "minimum effect size": float(model.minimum[k]) + spread,
+            "weak imitation": unhindered(model, k, config.share),
+        }
+        limits = {name: float(np.quantile(a, config.share, method="higher")) for name, a in drawn.items()} | fixed
+        each = np.maximum(np.max(list(drawn.values()), axis=0), max(fixed.values()))
+        found, limit = float(np.quantile(each, config.share, method="higher")), max(limits, key=limits.__getitem__)
         if found > model.room[k]:
-            found, limit = np.inf, "beyond its bounds" if np.isfinite(found) else limit
-        out.append(Smallest(found, alone["score test"], alone["validation"], least, step, found * strength, limit))
+            found, limit = np.inf, "beyond its bounds"
+        out.append(Smallest(found, limits, limit, found * strength))
+    return out
+
+
+def discrepancy_crossings(
+    model: LinearModel, k: int, strength: float, gains: GainDraws, config: RehearsalConfig
+) -> np.ndarray:
+    """[R] size of direction k from which U is above what the time step leaves, on both parts.
+
+    U is estimated: with noncentrality l, N M U is (l + g)^2 and the products of M residuals of noise, whose deviation
+    is sqrt(2 M).  Blocks have no such threshold: their U holds the noise.
+    """
+    if not model.repeated:
+        return np.zeros(config.draws)
+    rng, count = np.random.default_rng([config.seed, 3, k]), model.repeats
+    sizes = (strength, float(np.linalg.norm(gains.added[k])) * count**0.5)
+    out = np.zeros(config.draws)
+    for part, factor, unit in zip((model.train, model.validation), (WORST, 1.0), sizes, strict=True):
+        residuals = float(part.rows.counted.sum())
+        along, beside = rng.normal(size=(2, config.draws))
+        least = count * residuals * factor * model.step_error - np.sqrt(2 * residuals) * beside
+        needed = np.sqrt(np.maximum(along**2 + least, 0.0)) - along
+        out = np.maximum(out, np.maximum(needed, 0.0) / max(unit, 1e-30))
     return out
 
 
@@ -413,82 +303,3 @@ class GainDraws:
 def gain_draws(model: LinearModel, config: RehearsalConfig) -> GainDraws:
     """Noise of the validation test."""
     return GainDraws(model, np.nan_to_num(model.unabsorbed()), config)
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A candidate that an effect may be taken for.
-
-    key: of it.  share: of the effect's squared sensitivity that it takes too, within its bounds.  apart: size of the
-    effect from which the search distinguishes them; inf where it never does.
-    """
-
-    key: EffectKey
-    share: float
-    apart: float
-
-
-def rivals_of(model: LinearModel, k: int, size: float, config: DiscrepancyConfig, share: float) -> list[Rival]:
-    """The candidates that the search would not distinguish from direction k at some size, the nearest first.
-
-    By the search's own criterion: the worse of two models is worse in nearly all resamples of the validation
-    recording, and leaves so many times the U that the better one leaves.
-
-    Args:
-        model: the linear model.
-        k: the direction.
-        size: of the effect, where its rivals' bounds are looked at.
-        config: of the search.
-        share: of rehearsals in which they must be distinguished.
-    """
-    added = np.nan_to_num(model.unabsorbed())
-    target = model.sign[k] * added[k]
-    whole = float(target @ target)
-    if whole <= 0 or not np.isfinite(size):
-        return []
-    groups: dict[EffectKey, list[int]] = {}
-    for i, direction in enumerate(model.directions):
-        if direction.candidate.key != model.directions[k].candidate.key:
-            groups.setdefault(direction.candidate.shaped_key, []).append(i)
-    best: dict[EffectKey, float] = {}
-    for rows in groups.values():
-        taken = _taken(added[rows], size * target, model.low[rows], model.high[rows]) / (size**2 * whole)
-        key = model.directions[rows[0]].candidate.key
-        best[key] = max(best.get(key, 0.0), taken)
-    needed = _needed(model, config, share)
-    strength = whole * (model.repeats if model.repeated else 1)
-    out = []
-    for key, taken in best.items():
-        left = max(1.0 - taken, 0.0)
-        apart = float(np.sqrt(needed / (left * strength))) if left > 1e-9 else np.inf
-        if apart > size:
-            out.append(Rival(key, taken, apart if apart <= model.room[k] else np.inf))
-    return sorted(out, key=lambda r: -r.share)
-
-
-def _taken(columns: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """What coefficients with columns [C, M] within their bounds take of the square of a target [M]."""
-    seen = np.linalg.norm(columns, axis=1) > 1e-12
-    if not seen.any():
-        return 0.0
-    q, triangle = np.linalg.qr(columns[seen].T)
-    found = lsq_linear(triangle, q.T @ target, bounds=(low[seen] - 1e-12, high[seen] + 1e-12)).x
-    left = target - columns[seen].T @ found
-    return float(target @ target - left @ left)
-
-
-def _needed(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
-    """Squared noncentrality that must stand between two models for the search to distinguish them."""
-    selection = config.selection
-    aside = float(scipy.stats.norm.isf(selection.equivalence_doubt) + abs(scipy.stats.norm.isf(share)))
-    by_resamples = (2 * aside) ** 2
-    counted = float(model.validation.rows.counted.sum())
-    if model.repeated:  # U of the better one is noise about zero, of deviation sqrt(2 M) in these units
-        often = abs(float(scipy.stats.norm.isf(share)))
-        return max(by_resamples, (selection.equivalence_factor - 1) * often * (2 * counted) ** 0.5)
-    return max(by_resamples, (config.blocks.equivalence_factor - 1) * model.validation.level * counted)
-
-
-def longest_enough(model: LinearModel) -> bool:
-    """Whether there are rows enough for any effect to be told from chance."""
-    return (model.repeats if model.repeated else model.train.rows.units) >= FEWEST_REPEATS

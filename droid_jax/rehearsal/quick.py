@@ -37,7 +37,8 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
-from droid_jax.rehearsal.power import LinearModel, LinearPart, RehearsalConfig, rivals_of, smallest_sizes
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.power import smallest_sizes
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 
@@ -403,8 +404,7 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
                 "shape": dict(direction.candidate.shape_parameters),
                 "smallest": size.size,
                 "limit": size.limit,
-                "score_test": size.score,
-                "validation": size.gain,
+                "limits": dict(size.limits),
                 "minimum": float(model.minimum[k]),
                 "bound": float(model.room[k]),
                 "noncentrality": size.noncentrality,
@@ -492,6 +492,7 @@ def quick_rehearsal(
     tell: Tell = lambda stage: None,
     *,
     faster: bool = True,
+    step_error: bool = True,
 ) -> dict[str, Any]:
     """What a search in these recordings would find, as plain data (rehearsal.json).
 
@@ -505,6 +506,7 @@ def quick_rehearsal(
         rehearsal: what counts as found.
         tell: called with each stage's name.
         faster: whether a faster motion is looked at too.
+        step_error: whether to measure what the time step leaves, which takes another compilation.
 
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
@@ -512,7 +514,7 @@ def quick_rehearsal(
     began = time.monotonic()
     plan, config = plan or Plan(), config or DiscrepancyConfig()
     rehearsal = rehearsal or RehearsalConfig()
-    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell)
+    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
     tell("tests")
     known = answers(found, config, rehearsal)
     model = found.model.of(found.compared)

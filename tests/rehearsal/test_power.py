@@ -11,7 +11,8 @@ from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p
 from droid_jax.model.effects.candidate import Candidate
-from droid_jax.rehearsal.power import LinearModel, LinearPart, RehearsalConfig, rivals_of, smallest_sizes
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.power import smallest_sizes
 
 REPEATS, LENGTH, DIRECTIONS, BASE = 10, 160, 12, 4
 CONFIG, CASES = RehearsalConfig(draws=64), 60
