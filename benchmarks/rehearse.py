@@ -39,7 +39,7 @@ from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
 from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
-from droid_jax.rehearsal.quick import Plan, quick_rehearsal, rehearsed  # noqa: E402
+from droid_jax.rehearsal.quick import RehearsalPlan, quick_rehearsal, rehearsed  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record  # noqa: E402
 from experiments.blind.scenes import ROLES as ROLES_THERE  # noqa: E402
 from experiments.blind.scenes import Setting, setting  # noqa: E402
@@ -110,7 +110,7 @@ def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], Full
         channels=CHANNELS,
         seed=seed,
     )
-    rehearsal, plan = RehearsalConfig(seed=seed), Plan(channels=CHANNELS)
+    rehearsal, plan = RehearsalConfig(seed=seed), RehearsalPlan(channels=CHANNELS)
 
     def made() -> dict[str, Any]:
         began = time.monotonic()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
     from droid_jax.rehearsal.linear import RehearsalConfig
-    from droid_jax.rehearsal.quick import Plan
+    from droid_jax.rehearsal.quick import RehearsalPlan
 
 DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
 
@@ -157,10 +157,10 @@ def rehearsed_recordings(command: Rehearse) -> list[Recording]:
     return [load_recording(demonstration_path(name)) for name in DOOR_MOTIONS]
 
 
-def plan_of(command: Rehearse, base: Space, fit: Path | None) -> Plan:
+def plan_of(command: Rehearse, base: Space, fit: Path | None) -> RehearsalPlan:
     """What the options say of noise, repeats, channels and values."""
     from droid_jax.cost.channels import SIMULATED
-    from droid_jax.rehearsal.quick import Plan
+    from droid_jax.rehearsal.quick import RehearsalPlan
 
     noise = dict[str, float]()
     for entry in command.noise:
@@ -180,7 +180,7 @@ def plan_of(command: Rehearse, base: Space, fit: Path | None) -> Plan:
         values = dict(zip(base.names, values_of(fit, base).tolist(), strict=True))
     gap = as_gap(command)
     repeats = command.repeats or (None if command.recording else DOOR_REPEATS)
-    return Plan(repeats, noise or None, values, gap.compare or None)
+    return RehearsalPlan(repeats, noise or None, values, gap.compare or None)
 
 
 def _full(
@@ -189,7 +189,7 @@ def _full(
     base: Space,
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
-    plan: Plan,
+    plan: RehearsalPlan,
     config: DiscrepancyConfig,
     rehearsal: RehearsalConfig,
     quick: Mapping[str, Any],

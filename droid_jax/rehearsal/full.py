@@ -33,7 +33,7 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.quick import Plan, Rehearsed, hidden_directions, planned, simulated_channels
+from droid_jax.rehearsal.quick import RehearsalPlan, Rehearsed, hidden_directions, planned_recording, simulated_channels
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.servo_gains import scale_gains, servo_factors
 from droid_jax.storage import write_json
@@ -146,7 +146,7 @@ def synthetic_log(
     recording: Recording,
     values: np.ndarray,
     case: HiddenCase,
-    plan: Plan,
+    plan: RehearsalPlan,
     config: DiscrepancyConfig,
     rehearsal: RehearsalConfig,
     seed: int,
@@ -167,7 +167,7 @@ def synthetic_log(
         trace = simulated_channels(scene, whole, effects, recording, at, config)
     else:
         trace = _robot_trace(scene, space, recording, values, case, config, seed)
-    return planned(scene, recording, trace, full, rehearsal, seed)[0]
+    return planned_recording(scene, recording, trace, full, rehearsal, seed)[0]
 
 
 def _robot_trace(
@@ -261,7 +261,7 @@ class FullRehearsal:
     space: Space
     effects: tuple[Effect, ...]
     recordings: tuple[Recording, ...]
-    plan: Plan
+    plan: RehearsalPlan
     config: DiscrepancyConfig
     identify: IdentifyConfig
     rehearsal: RehearsalConfig

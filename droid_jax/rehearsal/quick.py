@@ -48,7 +48,7 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Plan:
+class RehearsalPlan:
     """What is rehearsed.
 
     repeats: of each recording; None: as many as it holds.  noise: channel -> deviation of one sample, in its unit,
@@ -143,7 +143,7 @@ def noisy(
     return clean + deviation * rng.normal(size=(repeats, *clean.shape))
 
 
-def unit_of(scene: Scene, name: str, columns: Sequence[str]) -> str:
+def unit_of_simulated(scene: Scene, name: str, columns: Sequence[str]) -> str:
     """Of a channel that nobody measured."""
     if name == "torque":
         return scene.torque_unit(columns)
@@ -162,8 +162,8 @@ def possible_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
     return tuple(name for name in SIMULATED if name != "object_angle" or seen)
 
 
-def planned(
-    scene: Scene, recording: Recording, rollout: Rollout, plan: Plan, config: RehearsalConfig, seed: int
+def planned_recording(
+    scene: Scene, recording: Recording, rollout: Rollout, plan: RehearsalPlan, config: RehearsalConfig, seed: int
 ) -> tuple[Recording, list[tuple[str, str, str, float, str]]]:
     """A recording with every channel that a replay has, and the noise of each column.
 
@@ -204,7 +204,7 @@ def planned(
             apart = None
             deviation, source = np.full(len(columns), config.noise[name]), "assumed"
         values = noisy(clean, repeats, deviation, apart, rng, mix)
-        unit = known.unit if known is not None else unit_of(scene, name, columns)
+        unit = known.unit if known is not None else unit_of_simulated(scene, name, columns)
         channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
         noise += [(name, c, unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
     others = {} if plan.simulated else {k: c for k, c in recording.channels.items() if k not in channels}
@@ -226,7 +226,7 @@ def rehearsed(
     space: Space,
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
-    plan: Plan,
+    plan: RehearsalPlan,
     config: DiscrepancyConfig,
     rehearsal: RehearsalConfig,
     tell: Tell = lambda stage: None,
@@ -267,7 +267,7 @@ def rehearsed(
             full, each = recording, _of_log(recording)
         else:
             rollout = simulated_channels(scene, whole, effects, recording, at, config)
-            full, each = planned(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+            full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
         made.append(full)
         noise = noise or each
     chosen = _compared(scene, recordings, made, plan, config)
@@ -305,7 +305,7 @@ def rehearsed(
 
 
 def _compared(
-    scene: Scene, given: Sequence[Recording], made: Sequence[Recording], plan: Plan, config: DiscrepancyConfig
+    scene: Scene, given: Sequence[Recording], made: Sequence[Recording], plan: RehearsalPlan, config: DiscrepancyConfig
 ) -> tuple[str, ...]:
     """The channels that the search would compare: those asked for, else of what is measured."""
     if config.channels:
@@ -486,7 +486,7 @@ def quick_rehearsal(
     space: Space,
     effects: Sequence[Effect],
     recordings: Sequence[Recording],
-    plan: Plan | None = None,
+    plan: RehearsalPlan | None = None,
     config: DiscrepancyConfig | None = None,
     rehearsal: RehearsalConfig | None = None,
     tell: Tell = lambda stage: None,
@@ -512,7 +512,7 @@ def quick_rehearsal(
         ValueError: what the search refuses too, or a simulation that blows up.
     """
     began = time.monotonic()
-    plan, config = plan or Plan(), config or DiscrepancyConfig()
+    plan, config = plan or RehearsalPlan(), config or DiscrepancyConfig()
     rehearsal = rehearsal or RehearsalConfig()
     found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
     tell("tests")

@@ -29,7 +29,7 @@ from droid_jax.rehearsal.full import (
     synthetic_log,
 )
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.quick import Plan, faster_motion, quick_rehearsal, rehearsed, sample_noise
+from droid_jax.rehearsal.quick import RehearsalPlan, faster_motion, quick_rehearsal, rehearsed, sample_noise
 from droid_jax.run import main
 
 HINGE = Path(__file__).resolve().parents[2] / "experiments" / "hinge.xml"
@@ -39,7 +39,7 @@ PARAMETERS = [
     {"field": "dof_damping", "element": "door", "unit": "N m s/rad", "std": 0.3, "high": 10.0},
     {"field": "body_mass", "element": "panel", "std": 0.1, "high": 5.0},
 ]
-PLAN = Plan(repeats=10, noise={"torque": 0.5}, channels=("torque",))
+PLAN = RehearsalPlan(repeats=10, noise={"torque": 0.5}, channels=("torque",))
 
 
 def motion(name: str = "train", period: float = 1.5) -> Recording:
