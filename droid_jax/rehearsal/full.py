@@ -164,7 +164,7 @@ def synthetic_log(
         at[whole.index(case.coefficient)] = p.mean + case.size * (1.0 if p.high > p.mean else -1.0)
         for name, value in (case.shape or {}).items():
             at[whole.index(name)] = value
-        trace = simulated_channels(scene, whole, effects, recording, at, config)
+        trace = simulated_channels(ready(scene), whole, effects, recording, at, config)
     else:
         trace = _robot_trace(scene, space, recording, values, case, config, seed)
     return planned_recording(scene, recording, trace, full, rehearsal, seed)[0]
@@ -302,7 +302,7 @@ def run_case(of: FullRehearsal, case: HiddenCase, folder: Path) -> dict[str, Any
 
 def _rehearse(of: FullRehearsal, case: HiddenCase, replays: Path) -> dict[str, Any]:
     rng = np.random.default_rng([of.seed, case.number])
-    scene, effects = ready(of.scene), beside(of.space, of.effects)
+    scene, effects = of.scene, beside(of.space, of.effects)
     values = drawn_values(of.space, of.known, rng)
     own = [p.name for p in of.space.of_role(Role.TORQUE_OFFSET) if p.nuisance]
     logs = list[Recording]()

@@ -251,7 +251,7 @@ def rehearsed(
     """
     clock = _Stopwatch(tell)
     clock("compile")
-    scene, effects = ready(scene), beside(space, effects)
+    effects = beside(space, effects)
     start = space.values(dict(plan.values or {}))
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
@@ -266,7 +266,7 @@ def rehearsed(
         if as_measured:
             full, each = recording, _of_log(recording)
         else:
-            rollout = simulated_channels(scene, whole, effects, recording, at, config)
+            rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
             full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
         made.append(full)
         noise = noise or each
@@ -523,7 +523,9 @@ def quick_rehearsal(
         moved = [faster_motion(r, rehearsal.faster) for r in recordings]
         other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
         try:
-            other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
+            with warnings.catch_warnings():  # what there is to warn of was said of the motion itself
+                warnings.simplefilter("ignore", UserWarning)
+                other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
         except ValueError as error:
             warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
     tell("improvements")
