@@ -126,7 +126,9 @@ def rehearsal_sentences(result: Result) -> list[str]:
         out.append(f"With this motion {listed(said)} would be found.")
         worst = found[-1]
         if len(found) > 3:
-            out.append(f"{_thing(worst)} below {quantity(worst['smallest'], worst['unit'], 2)} would not.".capitalize())
+            thing = _thing(worst)
+            size = quantity(worst["smallest"], worst["unit"], 2)
+            out.append(f"{thing[:1].upper()}{thing[1:]} below {size} would not.")
     if lost:
         names = listed(list(dict.fromkeys(_thing(e) for e in lost))[:6])
         out.append(f"At no size within its bounds: {names}.")
