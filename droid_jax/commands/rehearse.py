@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
     from droid_jax.rehearsal.linear import RehearsalConfig
-    from droid_jax.rehearsal.quick import RehearsalPlan
+    from droid_jax.rehearsal.plan import RehearsalPlan
 
 DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
 
@@ -160,7 +160,7 @@ def rehearsed_recordings(command: Rehearse) -> list[Recording]:
 def plan_of(command: Rehearse, base: Space, fit: Path | None) -> RehearsalPlan:
     """What the options say of noise, repeats, channels and values."""
     from droid_jax.cost.channels import SIMULATED
-    from droid_jax.rehearsal.quick import RehearsalPlan
+    from droid_jax.rehearsal.plan import RehearsalPlan
 
     noise = dict[str, float]()
     for entry in command.noise:

@@ -33,7 +33,8 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.quick import RehearsalPlan, Rehearsed, hidden_directions, planned_recording, simulated_channels
+from droid_jax.rehearsal.plan import RehearsalPlan, planned_recording, simulated_channels
+from droid_jax.rehearsal.quick import Rehearsed, hidden_directions
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.servo_gains import scale_gains, servo_factors
 from droid_jax.storage import write_json

@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
-from droid_jax.cost.cost import followed
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
@@ -28,44 +26,26 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
 from droid_jax.identify.multistart import RefineConfig, Refined
 from droid_jax.identify.search import NotReplayed
-from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
-from droid_jax.recordings.clocks import interpolate
-from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
-from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
 from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.plan import (
+    ColumnNoise,
+    RehearsalPlan,
+    faster_motion,
+    noise_of_log,
+    planned_recording,
+    simulated_channels,
+)
 from droid_jax.rehearsal.power import smallest_sizes
-from droid_jax.simulate.batching import in_blocks
-from droid_jax.simulate.compiled import compiled_replay
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
-RATE = 200.0  # Hz, of channels that nobody measured
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class RehearsalPlan:
-    """What is rehearsed.
-
-    repeats: of each recording; None: as many as it holds.  noise: channel -> deviation of one sample, in its unit,
-    stated.  values: parameter -> value where it stands; others at their means.  channels: to compare; None: the
-    search's own choice.
-    simulated: replace what was measured by what the replay and the noise make of the commands.
-    """
-
-    repeats: int | None = None
-    noise: Mapping[str, float] | None = None
-    values: Mapping[str, float] | None = None
-    channels: tuple[str, ...] | None = None
-
-    @property
-    def simulated(self) -> bool:
-        """Whether what was measured is replaced by what the replay and the noise make of the commands."""
-        return self.repeats is not None or self.noise is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,143 +62,8 @@ class Rehearsed:
     base: FittedModel
     model: LinearModel
     compared: tuple[str, ...]
-    noise: tuple[tuple[str, str, str, float, str], ...]
+    noise: tuple[ColumnNoise, ...]
     seconds: Mapping[str, float]
-
-
-def simulated_channels(
-    scene: Scene,
-    space: Space,
-    effects: Sequence[Effect],
-    recording: Recording,
-    values: np.ndarray,
-    config: DiscrepancyConfig,
-) -> Rollout:
-    """What the replay makes of a recording's commands at values [D], without noise: one sample, host arrays [T, ...].
-
-    Its times count from the recording's first command.
-    """
-    drive = followed(scene, recording, config.compare)
-    replay = compiled_replay("mjx", scene, space, drive, effects)
-    rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
-    if not bool(rollout.finite):
-        raise ValueError(
-            f"the simulation of {recording.name!r} blows up at the parameters' values: begin at other ones, or shorten "
-            "the scene's time step"
-        )
-    return rollout
-
-
-def sample_noise(channel: Channel) -> np.ndarray:
-    """[C] deviation of a measured channel from row to row, as if it were white: of its second differences."""
-    second = np.diff(np.where(channel.mask, channel.values, np.nan), n=2, axis=1)
-    spread = np.nanmedian(np.abs(second).reshape(-1, second.shape[-1]), axis=0)
-    return 1.4826 * np.nan_to_num(spread) / np.sqrt(6.0)
-
-
-def scattered(channel: Channel) -> np.ndarray | None:
-    """[N, T, C] deviations of the repeats from their mean where all was measured; None of one repeat."""
-    if len(channel.values) < 2:
-        return None
-    values = np.where(channel.mask, channel.values, np.nan)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # instants that nobody measured
-        return np.nan_to_num(values - np.nanmean(values, axis=0))
-
-
-def noisy(
-    clean: np.ndarray,
-    repeats: int,
-    deviation: np.ndarray,
-    apart: np.ndarray | None,
-    rng: np.random.Generator,
-    mix: np.ndarray,
-) -> np.ndarray:
-    """[N, T, C] a trace [T, C] with noise: what measured repeats [n, T, C] are apart, mixed anew, or white.
-
-    mix: [N, n] of normal numbers; the mixture has the covariance of the measured repeats.
-    """
-    if apart is not None:
-        return clean + np.einsum("nm,mtc->ntc", mix, apart) / np.sqrt(max(len(apart) - 1, 1))
-    return clean + deviation * rng.normal(size=(repeats, *clean.shape))
-
-
-def unit_of_simulated(scene: Scene, name: str, columns: Sequence[str]) -> str:
-    """Of a channel that nobody measured."""
-    if name == "torque":
-        return scene.torque_unit(columns)
-    return (
-        "/s or ".join(scene.position_unit(columns).split(" or ")) + "/s"
-        if name == "velocity"
-        else scene.position_unit(columns)
-    )
-
-
-def possible_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
-    """What a replay of a recording could be compared in."""
-    if not recording.command.size:
-        return ("torque",)
-    seen = scene.object_joint is not None and scene.object_joint not in scene.joints
-    return tuple(name for name in SIMULATED if name != "object_angle" or seen)
-
-
-def planned_recording(
-    scene: Scene, recording: Recording, rollout: Rollout, plan: RehearsalPlan, config: RehearsalConfig, seed: int
-) -> tuple[Recording, list[tuple[str, str, str, float, str]]]:
-    """A recording with every channel that a replay has, and the noise of each column.
-
-    What was measured stays, unless the plan says otherwise; what was not is simulated, with the noise that was stated,
-    measured or assumed.
-    """
-    rng = np.random.default_rng([seed, 11])
-    repeats = plan.repeats or recording.repeats
-    measured = [n for n in recording.channels if n in SIMULATED]
-    most = max((recording.channels[n].values.shape[0] for n in measured), default=1)
-    mix = rng.normal(size=(repeats, most))
-    channels, noise = dict[str, Channel](), list[tuple[str, str, str, float, str]]()
-    for name in possible_channels(scene, recording):
-        known = recording.channels.get(name)
-        stated = (plan.noise or {}).get(name)
-        apart = None if known is None or stated is not None else scattered(known)
-        if known is not None and not plan.simulated:
-            channels[name] = known
-            source = "repeats" if known.values.shape[0] > 1 else "log"
-            deviation = apart.std(axis=(0, 1)) if apart is not None else sample_noise(known)
-            noise += [(name, c, known.unit, float(d), source) for c, d in zip(known.columns, deviation, strict=True)]
-            continue
-        trace = getattr(rollout, name)
-        trace = trace[:, None] if trace.ndim == 1 else trace
-        if known is not None:
-            columns, time = known.columns, known.time
-        else:
-            columns = (str(scene.object_joint),) if name == "object_angle" else scene.joints
-            time = recording.time[0] + np.arange(0.0, float(rollout.time[-1]), 1.0 / RATE)
-        index = [0] if name == "object_angle" else [scene.joints.index(c) for c in columns if c in scene.joints]
-        columns = columns if name == "object_angle" else tuple(scene.joints[i] for i in index)
-        clean = interpolate(time, recording.time[0] + rollout.time, np.asarray(trace, float)[:, index])
-        if stated is not None:
-            deviation, source = np.full(len(columns), stated), "stated"
-        elif apart is not None and known is not None and len(columns) == len(known.columns):
-            deviation, source = apart.std(axis=(0, 1)) * np.sqrt(len(apart) / (len(apart) - 1)), "repeats"
-        else:
-            apart = None
-            deviation, source = np.full(len(columns), config.noise[name]), "assumed"
-        values = noisy(clean, repeats, deviation, apart, rng, mix)
-        unit = known.unit if known is not None else unit_of_simulated(scene, name, columns)
-        channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
-        noise += [(name, c, unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
-    others = {} if plan.simulated else {k: c for k, c in recording.channels.items() if k not in channels}
-    return replace(recording, channels={**channels, **others}), noise
-
-
-def _of_log(recording: Recording) -> list[tuple[str, str, str, float, str]]:
-    """The noise of a log whose windows or blocks stand for repeats: what fits leave of it counts, and this beside."""
-    return [
-        (name, column, channel.unit, float(deviation), "log, from row to row")
-        for name, channel in recording.channels.items()
-        if name in SIMULATED
-        for column, deviation in zip(channel.columns, sample_noise(channel), strict=True)
-    ]
 
 
 def rehearsed(
@@ -257,14 +102,14 @@ def rehearsed(
     at = whole.embed(space, start[None])[0]
     commanded = all(r.command.size for r in recordings)
     config = replace(config, channels=plan.channels or config.channels)
-    noise = list[tuple[str, str, str, float, str]]()
+    noise = list[ColumnNoise]()
     made = list[Recording]()
     if not commanded and plan.simulated:
         raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
     as_measured = not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS)
     for i, recording in enumerate(recordings):
         if as_measured:
-            full, each = recording, _of_log(recording)
+            full, each = recording, noise_of_log(recording)
         else:
             rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
             full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
@@ -470,15 +315,6 @@ def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig,
     limit = rehearsal.recovered or found.case.train.identifiability.identifiable
     nuisance = dict(zip(found.base.space.names, found.base.space.nuisance, strict=True))
     return sum(t.shrinkage < limit for t in told if not nuisance[t.name])
-
-
-def faster_motion(recording: Recording, factor: float) -> Recording:
-    """A commanded recording whose motion is made faster and then stands still, as long as before."""
-
-    def clock(new: np.ndarray, duration: float) -> np.ndarray:
-        return np.minimum(factor * new, duration)
-
-    return time_scaled(recording, TimeScaling(f"{recording.name}, {factor:g} times as fast", lambda d: d, clock))
 
 
 def quick_rehearsal(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.rehearse import next_step
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import CmaConfig
@@ -29,7 +30,8 @@ from droid_jax.rehearsal.full import (
     synthetic_log,
 )
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.quick import RehearsalPlan, faster_motion, quick_rehearsal, rehearsed, sample_noise
+from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
+from droid_jax.rehearsal.quick import quick_rehearsal, rehearsed
 from droid_jax.run import main
 
 HINGE = Path(__file__).resolve().parents[2] / "experiments" / "hinge.xml"
@@ -178,6 +180,15 @@ def test_page_and_json_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixt
 )
 def test_noise_that_is_none(refused, tmp_path: Path, given: str, said: str):
     assert said in refused("rehearse", "--noise", given, "--out", tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("known", "next_one"),
+    [({}, 1.0), ({1.0: True}, 0.7), ({1.0: True, 0.7: False}, None), ({1.0: True, 0.7: True, 0.5: True}, None),
+     ({1.0: False}, 1.4), ({1.0: False, 1.4: True}, None), ({1.0: False, 1.4: False, 2.0: False}, None)],
+)  # fmt: skip
+def test_the_benchmark_looks_for_the_smallest_size_that_is_found(known: dict[float, bool], next_one: float | None):
+    assert next_step(known) == next_one
 
 
 @pytest.mark.slow
