@@ -16,6 +16,7 @@ EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
 POLICY, TRAINING, TRANSFER, FILMS = "policy.npz", "training.json", "transfer.json", "films"
 EVALUATION, EVALUATION_TRACES = "evaluation.json", "evaluation.npz"  # of a fit on other recordings
 EVALUATION_FORMAT, EVALUATION_VERSION = "droid_jax evaluation", 1
+REHEARSAL, REHEARSAL_PAGE = "rehearsal.json", "rehearsal.html"
 SYNTHETIC_ROBOT = (
     "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
 )

@@ -40,6 +40,7 @@ from droid_jax.commands import (
     gap,
     identify,
     record,
+    rehearse,
     report,
     train,
     view,
@@ -57,6 +58,7 @@ Command = (
     | record.Record
     | convert.Convert
     | Annotated[check.CheckCommand, tyro.conf.subcommand("check")]
+    | rehearse.Rehearse
     | report.Report
     | view.View
 )
@@ -71,6 +73,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
     record.Record: record.run,
     convert.Convert: convert.run,
     check.CheckCommand: check.run,
+    rehearse.Rehearse: rehearse.run,
     report.Report: report.run,
     view.View: view.run,
 }
@@ -85,6 +88,7 @@ RESUMED = (
     identify.Identify,
     gap.GapCommand,
     train.Train,
+    rehearse.Rehearse,
 )  # commands that go on where they were stopped
 SHARED = (all_stages.All, identify.Identify, gap.GapCommand)  # commands of which several processes do a part each
 WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
@@ -223,5 +227,5 @@ def _going_on(command: Any) -> str:
     """How an interrupted command goes on, where it can."""
     if not isinstance(command, RESUMED):
         return ""
-    how = "the same command without --again" if command.again and BEGUN else "the same command"
+    how = "the same command without --again" if getattr(command, "again", False) and BEGUN else "the same command"
     return f"; {how} goes on from here"

@@ -512,6 +512,7 @@ COMMANDS = (
     "record",
     "convert",
     "check",
+    "rehearse",
     "report",
     "view",
 )

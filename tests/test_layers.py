@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "droid_jax"
 ORDER = (
     *("model", "recordings", "simulate", "preflight", "cost", "identify", "discrepancy", "policy", "report"),
     *("door", "synthetic"),  # the leaves: of the paper's door and of the synthetic robot no layer above knows anything
+    "rehearsal",  # hides effects in the synthetic robot
     *("commands", "run"),
 )
 FOR_ALL = (

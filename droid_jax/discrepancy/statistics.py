@@ -353,12 +353,14 @@ class Blocks:
         is |(1 - H) F z|^2.
         """
         flips = sign_flips(self.units, seed)
-        left = self._left(sensitivities, base, prior, flips)
+        left = self.left_after_flips(sensitivities, base, prior, flips)
         standardised = flips @ scores.T / self.units / np.sqrt(np.maximum(left, 1e-30))
         largest = np.max(np.abs(standardised), axis=1)
         return standardised[0], float(np.mean(largest >= largest[0] * (1 - 1e-12)))
 
-    def _left(self, sensitivities: np.ndarray, base: np.ndarray, prior: np.ndarray, flips: np.ndarray) -> np.ndarray:
+    def left_after_flips(
+        self, sensitivities: np.ndarray, base: np.ndarray, prior: np.ndarray, flips: np.ndarray
+    ) -> np.ndarray:
         """[F, K] squared size of each flipped sensitivity after projection, |(1 - H) F z|^2."""
         inverse = np.linalg.inv(base.T @ base + np.diag(prior**-2))
         taken = np.linalg.cholesky(inverse + inverse @ np.diag(prior**-2) @ inverse)  # of 2 H - H^2

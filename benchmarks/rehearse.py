@@ -1,0 +1,273 @@
+"""Is what a quick rehearsal predicts what complete ones find?
+
+    python benchmarks/rehearse.py [--quick] [--scenes hinge ...] [--minutes 60] [--out DIR] [--runs DIR]
+
+The lone hinge, an arm of two links beside a driven door, and the built-in door.  Each effect that has a place in the
+scene, and of which the synthetic robot has a law of its own, is hidden at the size that the quick form predicts; while
+it is found at smaller ones, while it is not at larger ones, of a ladder from 0.5 to 2 times that size.  Every log is
+fitted and searched (`droid_jax.rehearsal.full`).  One folder a case under RUNS: the run can be stopped and goes on
+where it was.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
+
+import tuned  # noqa: E402, F401  (before jax starts)
+
+# isort: split
+import json  # noqa: E402
+import time  # noqa: E402
+from collections.abc import Callable, Mapping, Sequence  # noqa: E402
+from dataclasses import dataclass, replace  # noqa: E402
+from typing import Any  # noqa: E402
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from benchmarks.common import CODE, publish  # noqa: E402
+from benchmarks.sharing import claimed, kept  # noqa: E402
+from droid_jax.commands.options import refine_config, search_config  # noqa: E402
+from droid_jax.commands.rehearse import plain  # noqa: E402
+from droid_jax.discrepancy.candidates import observable_effects  # noqa: E402
+from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig  # noqa: E402
+from droid_jax.identify.multistart import RefineConfig  # noqa: E402
+from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
+from droid_jax.recordings.recording import Recording  # noqa: E402
+from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
+from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
+from droid_jax.rehearsal.plan import RehearsalPlan  # noqa: E402
+from droid_jax.rehearsal.quick import quick_rehearsal, rehearsed  # noqa: E402
+from droid_jax.synthetic.robot import SyntheticRobotConfig, record  # noqa: E402
+from experiments.blind.scenes import ROLES as ROLES_THERE  # noqa: E402
+from experiments.blind.scenes import Setting, setting  # noqa: E402
+
+SCENES = ("hinge", "bench", "door")
+LADDER = (0.5, 0.7, 1.0, 1.4, 2.0)  # times the predicted size
+SEEDS = 1
+REPEATS = 10
+FACTOR = 1.5  # a prediction that is off by less counts as right
+CHANNELS = ("torque",)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options."""
+
+    quick: bool = False
+    """One effect of the hinge at one size; its numbers are not for keeping."""
+    scenes: tuple[str, ...] = SCENES
+    """To make cases in; the others are summed up, if any are there."""
+    seeds: int = SEEDS
+    """Cases of each effect at each size that is tried; it counts as found there if it is in all of them."""
+    minutes: float = 0.0
+    """No case is begun after so many; 0: all are made."""
+    sum_only: bool = False
+    """Make no case: sum up those that are there."""
+    seed: int = 0
+    """Of all draws."""
+    runs: Path | None = None
+    """Folder of the cases; default: runs/rehearse, of --quick below OUT."""
+    out: Path = ROOT / "benchmarks" / "results"
+    """Folder of rehearse.json."""
+
+
+def measured(where: Setting, seed: int) -> list[Recording]:
+    """Two motions of a robot of which nothing is hidden: their commands, and how their repeats scatter."""
+    truth = dict(zip(where.base.names, where.base.mean.tolist(), strict=True))
+    config = SyntheticRobotConfig(repeats=REPEATS)
+    out = []
+    for number, role in enumerate(ROLES_THERE[:2]):
+        demonstration = where.demonstrations[role]
+        log = _recorded(where, demonstration, truth, 10 * seed + number, config)
+        out.append(replace(log, name=role, channels={n: log.channels[n] for n in ("position", *CHANNELS)}))
+    return out
+
+
+def _recorded(
+    where: Setting, demonstration: Recording, truth: Mapping[str, float], seed: int, config: SyntheticRobotConfig
+) -> Recording:
+    if where.name == "door":
+        return record(where.scene, demonstration, truth, seed=seed, config=config)
+    from droid_jax.simulate.c_engine import simulate
+    from droid_jax.synthetic.robot import as_recording, sensor_torque, set_up
+
+    robot = set_up(where.scene, demonstration, truth, seed=seed, config=config, space=where.base)
+    trace = simulate(robot.scene, robot.models, robot.qpos0, robot.control[None])
+    return as_recording(robot, trace, sensor_torque(robot, trace), trace.position)
+
+
+def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], FullRehearsal]:
+    """The quick rehearsal of a scene, kept, and what its complete ones share."""
+    where = setting(name, runs / "door")
+    recordings = measured(where, seed)
+    effects = observable_effects(where.scene, recordings, channels=CHANNELS)
+    config = DiscrepancyConfig(
+        search=search_config("quick", seed),
+        refine=replace(refine_config("quick") or RefineConfig(), iterations=CONVERGE_ITERATIONS),
+        channels=CHANNELS,
+        seed=seed,
+    )
+    rehearsal, plan = RehearsalConfig(seed=seed), RehearsalPlan(channels=CHANNELS)
+
+    def made() -> dict[str, Any]:
+        began = time.monotonic()
+        found = quick_rehearsal(where.scene, where.base, effects, recordings, plan, config, rehearsal)
+        return plain({**found, "code": CODE.get("git"), "whole_seconds": time.monotonic() - began})
+
+    quick = kept(runs / f"quick_{name}_seed{seed}.json", made)
+    identify = IdentifyConfig(search=search_config("quick", seed), refine=refine_config("quick"), samples=0)
+    found = rehearsed(where.scene, where.base, effects, recordings, plan, config, rehearsal, step_error=False)
+    return quick, FullRehearsal(
+        where.scene, where.base, effects, tuple(recordings), plan, config, identify, rehearsal, found, seed
+    )
+
+
+def asked(quick: Mapping[str, Any], of: FullRehearsal) -> list[dict[str, Any]]:
+    """One place and coefficient of each effect that the synthetic robot has a law of its own for."""
+    best: dict[str, dict[str, Any]] = {}
+    for entry in quick["effects"]:
+        if entry["smallest"] is None or not hidden_case(of.scene, 0, entry, 1.0).hidden:
+            continue
+        known = best.get(entry["effect"])
+        if known is None or entry["smallest"] < known["smallest"]:
+            best[entry["effect"]] = entry
+    return list(best.values())
+
+
+def next_step(steps: Mapping[float, bool]) -> float | None:
+    """The size to try next, where `steps` are known to be found or not; None where the smallest found one is known."""
+    rungs = list(LADDER)
+    if not steps:
+        return 1.0
+    found = [t for t, f in steps.items() if f]
+    if found:
+        below = rungs.index(min(found)) - 1
+        return rungs[below] if below >= 0 and rungs[below] not in steps else None
+    above = rungs.index(max(steps)) + 1
+    return rungs[above] if above < len(rungs) else None
+
+
+def cases_at(of: FullRehearsal, entry: Mapping[str, Any], index: int, times: float, seeds: int) -> list[HiddenCase]:
+    """The cases of one effect at one size."""
+    rung = LADDER.index(times)
+    return [hidden_case(of.scene, 1000 * seed + 100 * rung + index, entry, times) for seed in range(seeds)]
+
+
+def kept_case(folder: Path, case: HiddenCase) -> dict[str, Any] | None:
+    """The result of a case, if it is there."""
+    path = folder / case.name / "result.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def staircase(
+    of: FullRehearsal,
+    entry: Mapping[str, Any],
+    index: int,
+    arguments: Arguments,
+    folder: Path,
+    late: Callable[[], bool],
+) -> list[dict[str, Any]]:
+    """The cases of one effect, made as far as time allows."""
+    steps, made, seeds = dict[float, bool](), list[dict[str, Any]](), 1 if arguments.quick else arguments.seeds
+    while (times := next_step(steps)) is not None:
+        found = list[bool]()
+        for case in cases_at(of, entry, index, times, seeds):
+            result = kept_case(folder, case)
+            if result is None and not late():
+                with claimed(folder / case.name / "result.json", wait=True):
+                    result = run_case(of, case, folder)
+                named = " + ".join(result["effects"]) or result["verdict"]
+                print(f"{case.name}: {named}, {result['seconds']:.0f} s {result.get('error', '')}", flush=True)
+            if result is None:
+                return made
+            made.append(result)
+            found.append(bool(result["found"]))
+        steps[times] = all(found)
+        if arguments.quick:
+            break
+    return made
+
+
+def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One effect: at which multiples of the predicted size it was found, and which of them is the smallest."""
+    steps = sorted({c["times"] for c in cases})
+    rates = {t: [bool(c["found"]) for c in cases if c["times"] == t] for t in steps}
+    known = {t: all(f) for t, f in rates.items()}
+    found, whole = [t for t in steps if known[t]], bool(steps) and next_step(known) is None
+    ratio = (min(found) if found else np.inf) if whole else None
+    return {
+        "effect": entry["effect"],
+        "location": entry["location"],
+        "predicted": entry["smallest"],
+        "unit": entry["unit"],
+        "limit": entry["limit"],
+        "form": cases[0]["form"] if cases else None,
+        "amplitude_over_size": cases[0]["amplitude"] / cases[0]["size"] if cases else None,
+        "found": {f"{t:g}": [int(sum(f)), len(f)] for t, f in rates.items()},
+        "measured_over_predicted": None if ratio is None or not np.isfinite(ratio) else ratio,
+        "not_found_at_twice": bool(whole and not found),
+        "within": None if ratio is None else bool(1 / FACTOR <= ratio <= FACTOR),
+        "answers": [c["sentence"] if "sentence" in c else c["error"] for c in cases],
+    }
+
+
+def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """Shares over the effects whose smallest size is known.
+
+    Wrong advice: said to be found and not found at twice the size, or found at half of it.
+    """
+    done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
+    wrong = [e["not_found_at_twice"] or e["measured_over_predicted"] == LADDER[0] for e in done]
+    return {
+        "effects": len(done),
+        "within_factor": float(np.mean([e["within"] for e in done])) if done else None,
+        "wrong_advice_rate": float(np.mean(wrong)) if done else None,
+    }
+
+
+def main(arguments: Arguments) -> None:
+    """Make the cases that are not there, and sum up those that are."""
+    began = time.monotonic()
+    runs = arguments.runs or (arguments.out if arguments.quick else ROOT / "runs") / "rehearse"
+    runs = runs / ("quick" if arguments.quick else f"seed{arguments.seed}")
+    scenes = ("hinge",) if arguments.quick else arguments.scenes
+    effects, seconds, case_seconds = dict[str, list[dict[str, Any]]](), dict[str, float](), list[float]()
+    for scene in SCENES:
+        if scene not in scenes and not (runs / f"quick_{scene}_seed{arguments.seed}.json").is_file():
+            continue
+        quick, of = rehearsal_of(scene, runs, arguments.seed)
+        seconds[scene] = quick["whole_seconds"]
+
+        def late(scene: str = scene) -> bool:
+            over = bool(arguments.minutes) and time.monotonic() - began > 60 * arguments.minutes
+            return over or arguments.sum_only or scene not in scenes
+
+        entries = asked(quick, of)[: 1 if arguments.quick else None]
+        effects[scene] = []
+        for index, entry in enumerate(entries):
+            made = staircase(of, entry, index, arguments, runs / scene, late)
+            case_seconds += [c["seconds"] for c in made]
+            effects[scene].append(judged(entry, made))
+    whole = summary(effects)
+    result = {
+        **whole,
+        "seconds_door": seconds.get("door"),
+        "seconds_quick": seconds,
+        "seconds_case_median": float(np.median(case_seconds)) if case_seconds else None,
+        "cases": len(case_seconds),
+        "plan": {"scenes": list(SCENES), "ladder": sorted(LADDER), "seeds": arguments.seeds, "repeats": REPEATS},
+        "not_measured": [s for s in SCENES if s not in effects],
+        "by_scene": {scene: {**summary({scene: some}), "effects": some} for scene, some in effects.items()},
+    }
+    publish(
+        arguments.out, "rehearse", arguments.quick, arguments.seed, result, line={**whole, "cases": len(case_seconds)}
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments, description=__doc__))

@@ -1,0 +1,255 @@
+"""`rehearse`: would this work on my robot, with this motion?"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from droid_jax.commands.folder import fingerprints, setup_of, stage_folder
+from droid_jax.commands.gap import GapCommand, chosen_effects, gap_config, gap_model, values_of
+from droid_jax.commands.options import (
+    Channel,
+    JointFriction,
+    load_effects,
+    needs_recording,
+    needs_scene,
+    recording_at,
+    refine_config,
+    search_config,
+    warn_of_cpu,
+)
+from droid_jax.commands.writer import writes
+from droid_jax.files import FIT, REHEARSAL, REHEARSAL_PAGE
+
+if TYPE_CHECKING:
+    from droid_jax.discrepancy.config import DiscrepancyConfig
+    from droid_jax.model.effect_interface import Effect
+    from droid_jax.model.parameters import Space
+    from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
+    from droid_jax.rehearsal.linear import RehearsalConfig
+    from droid_jax.rehearsal.plan import RehearsalPlan
+
+DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
+
+
+@dataclass(frozen=True)
+class Rehearse:
+    """Would this work on my robot, with this motion? Which parameters and effects could be told, and from which size.
+
+    Quick, without fits: from what each parameter and each effect changes, beside the noise. --full makes synthetic
+    logs with something hidden, and fits and searches them.
+    """
+
+    recording: tuple[Path, ...] = ()
+    """Recordings as `gap` takes them. Their commands and their noise are used, or their commands alone (--repeats).
+    Default: two motions of the built-in door."""
+    repeats: int | None = None
+    """Rehearse so many repeats of each motion: what was measured is replaced by what the scene makes of the
+    commands."""
+    noise: tuple[str, ...] = ()
+    """channel=deviation of one sample, for example torque=0.05 position=1e-4, in N m, rad, m or per second. Default: as
+    the repeats scatter, else as for a Panda."""
+    fit: Path | None = None
+    """Folder of a finished `identify`: parameters stand there instead of at their initial means."""
+    full: int = 0
+    """Make so many complete rehearsals: synthetic logs, fitted and searched. Each takes as long as `gap` does."""
+    compare: tuple[Channel, ...] = ()
+    """Measured channels to compare; default: as in gap."""
+    preset: Literal["quick", "standard", "gpu"] = "quick"
+    """Of the fits of --full, as in identify."""
+    scene: Path | None = None
+    """Your own MJCF instead of the built-in door."""
+    parameters: Path | None = None
+    """JSON list of the parameters of your own scene (docs/your-robot.md)."""
+    joints: tuple[str, ...] = ()
+    """Measured joints of your own scene; default: all driven joints."""
+    object_joint: str | None = None
+    """Joint of the thing that is moved, in your own scene."""
+    joint_friction: JointFriction = "held"
+    """Dry friction of your own scene's joints, as in gap."""
+    effects: tuple[str, ...] = ()
+    """Effects of the library to hide; default: all that the scene can have."""
+    without: tuple[str, ...] = ()
+    """Effects of the library to leave out."""
+    effect_scale: float = 1.0
+    """Forces and torques of the library's effects, as in gap."""
+    user_effects: Path | None = None
+    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    seed: int = 0
+    """Seed of the drawn noise and of the hidden robots."""
+    out: Path = Path("runs/rehearse")
+    """Folder of rehearsal.html and rehearsal.json. Rehearsals of --full that are there are not made again."""
+
+
+@writes(None)
+def run(command: Rehearse) -> None:
+    """Rehearse, write page and JSON, and say the answer."""
+    from droid_jax import runtime
+
+    needs_scene(command)
+    needs_recording(command)
+    if command.full < 0 or (command.repeats is not None and command.repeats < 1):
+        raise ValueError("--full and --repeats count: give whole numbers above 0")
+    runtime.start()
+    if command.full:
+        warn_of_cpu(command.preset)
+    from droid_jax.rehearsal.linear import RehearsalConfig
+    from droid_jax.rehearsal.quick import quick_rehearsal
+    from droid_jax.storage import refuse_special, write_own
+
+    refuse_special(command.out, "a folder")
+    fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
+    load_effects(command.user_effects, fit)
+    gap = as_gap(command)
+    scene, base = gap_model(gap)
+    recordings = rehearsed_recordings(command)
+    plan = plan_of(command, base, fit)
+    effects = chosen_effects(gap, scene, [] if plan.channels else recordings)
+    config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
+    result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
+    setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}
+    if command.full:
+        result |= _full(command, scene, base, effects, recordings, plan, config, rehearsal, result, setup)
+    result |= {"scene": scene.name, "setup": setup, "versions": runtime.versions(), "device": runtime.device()}
+    from droid_jax.report.rehearsal_page import rehearsal_page
+
+    text = json.dumps(plain(result), indent=1, allow_nan=False) + "\n"
+    page = rehearsal_page(json.loads(text))
+    write_own(command.out, {REHEARSAL: text.encode(), REHEARSAL_PAGE: page.encode()})
+    _show(json.loads(text))
+    print(f"page: {command.out / REHEARSAL_PAGE}")
+
+
+def as_gap(command: Rehearse) -> GapCommand:
+    """The search that is rehearsed."""
+    channels = command.compare
+    if not command.recording and not channels:
+        channels = ("torque",)
+    return GapCommand(
+        recording=command.recording,
+        compare=channels,
+        preset=command.preset,
+        scene=command.scene,
+        parameters=command.parameters,
+        joints=command.joints,
+        object_joint=command.object_joint,
+        joint_friction=command.joint_friction,
+        effects=command.effects,
+        without=command.without,
+        effect_scale=command.effect_scale,
+        seed=command.seed,
+    )
+
+
+def rehearsed_recordings(command: Rehearse) -> list[Recording]:
+    """Those given, or two motions of the built-in door."""
+    if command.recording:
+        return [recording_at(path) for path in command.recording]
+    from droid_jax.door.demonstration import demonstration_path
+    from droid_jax.recordings.formats import load_recording
+
+    return [load_recording(demonstration_path(name)) for name in DOOR_MOTIONS]
+
+
+def plan_of(command: Rehearse, base: Space, fit: Path | None) -> RehearsalPlan:
+    """What the options say of noise, repeats, channels and values."""
+    from droid_jax.cost.channels import SIMULATED
+    from droid_jax.rehearsal.plan import RehearsalPlan
+
+    noise = dict[str, float]()
+    for entry in command.noise:
+        name, _, text = entry.partition("=")
+        try:
+            deviation = float(text)
+        except ValueError:
+            deviation = math.nan
+        if name not in SIMULATED or not (math.isfinite(deviation) and deviation > 0):
+            raise ValueError(
+                f"--noise takes channel=deviation above 0, for example torque=0.05, got {entry!r}; channels: "
+                f"{', '.join(SIMULATED)}"
+            )
+        noise[name] = deviation
+    values = None
+    if fit is not None:
+        values = dict(zip(base.names, values_of(fit, base).tolist(), strict=True))
+    gap = as_gap(command)
+    repeats = command.repeats or (None if command.recording else DOOR_REPEATS)
+    return RehearsalPlan(repeats, noise or None, values, gap.compare or None)
+
+
+def _full(
+    command: Rehearse,
+    scene: Scene,
+    base: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    plan: RehearsalPlan,
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+    quick: Mapping[str, Any],
+    setup: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The complete rehearsals and their scores."""
+    from droid_jax.identify.pipeline import IdentifyConfig
+    from droid_jax.rehearsal.full import FullRehearsal, hidden_cases, run_cases, scores
+    from droid_jax.rehearsal.quick import rehearsed
+
+    if not all(r.command.size for r in recordings):
+        raise ValueError("--full needs recordings with commands: a log without them prescribes its motion")
+    found = rehearsed(scene, base, effects, recordings, plan, config, rehearsal, step_error=False)
+    identify = IdentifyConfig(
+        search=search_config(command.preset, command.seed), refine=refine_config(command.preset), samples=0
+    )
+    of = FullRehearsal(
+        scene, base, tuple(effects), tuple(recordings), plan, config, identify, rehearsal, found,
+        command.seed,
+    )  # fmt: skip
+    decides = {k: v for k, v in setup.items() if k != "full"}
+    name = hashlib.sha256(json.dumps(plain(decides), sort_keys=True).encode()).hexdigest()[:12]
+    cases = hidden_cases(scene, quick["effects"], command.full)
+    results = run_cases(of, cases, command.out / "rehearsals" / name, lambda said: print(said, flush=True))
+    return {"form": "full", "full": scores(results, rehearsal.share), "cases": results}
+
+
+def plain(value: Any) -> Any:
+    """Plain data for JSON: no infinities and no arrays."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _tell(stage: str) -> None:
+    print(f"{stage} ...", flush=True)
+
+
+def _show(result: Mapping[str, Any]) -> None:
+    """The tables and the sentences on the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from droid_jax.report.rehearsal_page import effect_rows, parameter_rows, rehearsal_sentences
+
+    console = Console()
+    for title, head, rows in (
+        ("parameters", ("parameter", "of the prior's width left", "recovered", "trades with"), parameter_rows(result)),
+        ("effects", ("effect", "place", "found from", "decided by", "taken for"), effect_rows(result)),
+    ):
+        table = Table(title=title)
+        for name in head:
+            table.add_column(name, overflow="fold")
+        for row in rows:
+            table.add_row(*map(Text, row))
+        console.print(table)
+    for sentence in rehearsal_sentences(result):
+        console.print(Text(sentence))

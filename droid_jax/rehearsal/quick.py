@@ -1,0 +1,426 @@
+"""The quick form: what would be found and recovered, from sensitivities alone, without a search.
+
+The search's own case is made of the recordings, or of what the replay and a stated noise make of their commands.
+Parameters stand where they are known; each candidate effect is simulated once with a small coefficient.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from droid_jax.cost.channels import SIMULATED
+from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
+from droid_jax.discrepancy.case import Case, ResidualSet, comparing
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, discretisation_error, refit
+from droid_jax.discrepancy.log_case import base_model, case_of
+from droid_jax.identify.gaussian import Gaussian
+from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
+from droid_jax.identify.multistart import RefineConfig, Refined
+from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effects.candidate import candidates
+from droid_jax.model.effects.registry import beside, joined, ready
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene
+from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.split import Split, roles_of, split_of
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.plan import (
+    ColumnNoise,
+    RehearsalPlan,
+    faster_motion,
+    noise_of_log,
+    planned_recording,
+    simulated_channels,
+)
+from droid_jax.rehearsal.power import smallest_sizes
+
+AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """A linear model with what it came from.
+
+    model: of all channels that are known or assumed.  compared: those that the search compares.  refined: slopes of
+    the base parameters.  deviations: of the repeats.  noise: (channel, column, unit, deviation, source) of one sample.
+    """
+
+    split: Split
+    case: Case
+    roles: Mapping[str, Recording]
+    base: FittedModel
+    model: LinearModel
+    compared: tuple[str, ...]
+    noise: tuple[ColumnNoise, ...]
+    seconds: Mapping[str, float]
+
+
+def rehearsed(
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    plan: RehearsalPlan,
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+    tell: Tell = lambda stage: None,
+    *,
+    step_error: bool = True,
+) -> Rehearsed:
+    """The linear model of a search in these recordings.
+
+    Args:
+        scene: the robot.
+        space: all that is fitted without any effect.
+        effects: that could be hidden.
+        recordings: as given to the search.
+        plan: what is planned beside what was measured.
+        config: of the search.
+        rehearsal: what is assumed.
+        tell: called with each stage's name.
+        step_error: whether to measure what the time step leaves, which takes another compilation.
+
+    Raises:
+        ValueError: what the search refuses too, or a simulation that blows up.
+    """
+    clock = _Stopwatch(tell)
+    clock("compile")
+    effects = beside(space, effects)
+    start = space.values(dict(plan.values or {}))
+    whole = joined(space, effects)
+    at = whole.embed(space, start[None])[0]
+    commanded = all(r.command.size for r in recordings)
+    config = replace(config, channels=plan.channels or config.channels)
+    noise = list[ColumnNoise]()
+    made = list[Recording]()
+    if not commanded and plan.simulated:
+        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
+    as_measured = not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS)
+    for i, recording in enumerate(recordings):
+        if as_measured:
+            full, each = recording, noise_of_log(recording)
+        else:
+            rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
+            full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        made.append(full)
+        noise = noise or each
+    chosen = _compared(scene, recordings, made, plan, config)
+    split = split_of(made)
+    roles = roles_of(split, made)
+    every = _alike(made) if commanded and split is not Split.WINDOWS else chosen
+    clock("case")
+    needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
+    case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
+    values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
+    clock("base")
+    if split is Split.BLOCKS:
+        base = base_model(case)
+        values = base.values
+    else:
+        base = refit(case.train, case.base, (), values[None], AT_REST)
+    clock("sensitivities")
+    directions = directions_of(candidates(case.effects))
+    train = part_of(case.train, base, directions)
+    if split is Split.REPEATS:
+        validation = train
+    else:
+        beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
+        validation = part_of(case.validation, beside_base, directions, base.refined.free)
+    error = 0.0
+    if step_error and split is not Split.BLOCKS:
+        clock("step error")
+        try:
+            error = discretisation_error(case.train, base, roles["train"])
+        except NotReplayed:
+            error = 0.0
+    clock("")
+    model = linear_model(case, base, directions, train, validation, error)
+    return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
+
+
+def _compared(
+    scene: Scene, given: Sequence[Recording], made: Sequence[Recording], plan: RehearsalPlan, config: DiscrepancyConfig
+) -> tuple[str, ...]:
+    """The channels that the search would compare: those asked for, else of what is measured."""
+    if config.channels:
+        return tuple(n for n in SIMULATED if n in config.channels)
+    if plan.noise:  # what is stated is what will be measured
+        named = [n for n in SIMULATED if n in plan.noise and all(n in r.channels for r in made)]
+        if named:
+            kept = [replace(r, channels={n: r.channels[n] for n in named}) for r in made]
+            return tuple(comparing(scene, kept, config).compare.channels)
+    return tuple(comparing(scene, given, config).compare.channels)
+
+
+def _alike(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Channels that all of them have."""
+    return tuple(n for n in SIMULATED if all(n in r.channels for r in recordings))
+
+
+def part_of(
+    residual_set: ResidualSet, base: FittedModel, directions: Sequence[ScoreDirection], free: np.ndarray | None = None
+) -> LinearPart:
+    """A part of the recordings in the linear model, at the values of `base`."""
+    free = base.refined.free if free is None else free
+    root = residual_set.repeats**0.5
+    names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
+    channel = np.array(names)[residual_set.column]
+    raw = sensitivities(residual_set, base.values, directions)
+    level = 0.0 if residual_set.resampling.repeated else base.discrepancy
+    return LinearPart(raw, base.refined.jacobian[:, free] / root, residual_set.resampling, channel, level)
+
+
+def linear_model(
+    case: Case,
+    base: FittedModel,
+    directions: Sequence[ScoreDirection],
+    train: LinearPart,
+    validation: LinearPart,
+    step_error: float,
+) -> LinearModel:
+    """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
+    space, minimum = case.full_space, case.minimum_sizes
+    of = [space[d.coefficient] for d in directions]
+    return LinearModel(
+        directions=tuple(directions),
+        train=replace(train, raw=np.nan_to_num(train.raw)),
+        validation=replace(validation, raw=np.nan_to_num(validation.raw)),
+        prior=base.refined.prior[base.refined.free],
+        slack=case.train.prior_slack,
+        repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
+        step_error=step_error,
+        minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
+        low=np.array([p.low - p.mean for p in of]),
+        high=np.array([p.high - p.mean for p in of]),
+    )
+
+
+def hidden_directions(model: LinearModel) -> list[int]:
+    """Of each coefficient at each place one direction: in the middle of the shapes that are tried."""
+    groups: dict[str, list[int]] = {}
+    for k, direction in enumerate(model.directions):
+        groups.setdefault(direction.coefficient, []).append(k)
+    return [rows[len(rows) // 2] for rows in groups.values()]
+
+
+def told_parameters(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
+    """What the recordings would say of each base parameter; more: times as many of them."""
+    refined, train = found.base.refined, found.case.train
+    seen = np.isin(found.model.train.channel, np.unique(model.train.channel))
+    if not found.model.repeated:  # the validation blocks are fitted by `identify` too
+        more = 2 * more
+    jacobian = refined.jacobian[seen] * np.sqrt(more * model.repeats / max(found.model.repeats, 1))
+    part = replace(refined, jacobian=jacobian, residual=refined.residual[seen])
+    gaussian = with_stated_prior(_posterior(part, model, train), part)
+    return identifiability(gaussian, part.prior, train.identifiability)
+
+
+def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaussian:
+    rows = model.train.rows
+    deviations = [rows.deviations] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
+    return calibrated(refined, deviations, None, train.identifiability.pooling)
+
+
+def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalConfig) -> list[dict[str, Any]]:
+    """Of each coefficient at each place: the smallest size that is found, and what it is taken for."""
+    model, space = found.model.of(found.compared), found.case.full_space
+    wanted = hidden_directions(model)
+    out = []
+    for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config.selection), strict=True):
+        direction, p = model.directions[k], space[model.directions[k].coefficient]
+        rivals = rivals_of(model, k, size.size, config, rehearsal.share)
+        out.append(
+            {
+                "effect": direction.candidate.effect,
+                "location": direction.candidate.location,
+                "coefficient": direction.coefficient,
+                "unit": p.unit,
+                "shape": dict(direction.candidate.shape_parameters),
+                "smallest": size.size,
+                "limit": size.limit,
+                "limits": dict(size.limits),
+                "minimum": float(model.minimum[k]),
+                "bound": float(model.room[k]),
+                "noncentrality": size.noncentrality,
+                "taken_for": [
+                    {"effect": r.key.effect, "location": r.key.location, "share": r.share, "below": r.apart}
+                    for r in rivals
+                ],
+            }
+        )
+    return out
+
+
+def improvements(
+    found: Rehearsed,
+    known: Sequence[Mapping[str, Any]],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+    faster: Rehearsed | None = None,
+) -> list[dict[str, Any]]:
+    """What more repeats, another channel or another motion would change, the most helpful first."""
+    model = found.model.of(found.compared)
+    wanted = hidden_directions(model)
+    before = np.array([e["smallest"] for e in known])
+    recovered = _recovered(found, model, rehearsal)
+    out = []
+    for what, other, more, source in _variants(found, faster):
+        if source is found and not other.repeated and more > 1:
+            after, told = before / np.sqrt(more), _recovered(found, other, rehearsal, more)
+        else:
+            sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
+            after, told = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
+        both = np.isfinite(before) & np.isfinite(after)
+        ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
+        out.append(
+            {
+                "what": what,
+                "times_smaller": ratio,
+                "newly_found": int(np.sum(~np.isfinite(before) & np.isfinite(after))),
+                "lost": int(np.sum(np.isfinite(before) & ~np.isfinite(after))),
+                "recovered_more": told - recovered,
+            }
+        )
+    return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
+
+
+def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
+    model = found.model.of(found.compared)
+    for factor in (2, 4):
+        if model.repeated:
+            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0, found
+        else:
+            yield f"a log {factor} times as long", model, float(factor), found
+    for name in dict.fromkeys(found.model.train.channel.tolist()):
+        if name not in found.compared:
+            what = name.replace("_", " ")
+            yield f"{what} compared too", found.model.of((*found.compared, name)), 1.0, found
+    if faster is not None:
+        yield "the faster motion", faster.model.of(found.compared), 1.0, faster
+
+
+def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
+    told = told_parameters(found, model, more)
+    limit = rehearsal.recovered or found.case.train.identifiability.identifiable
+    nuisance = dict(zip(found.base.space.names, found.base.space.nuisance, strict=True))
+    return sum(t.shrinkage < limit for t in told if not nuisance[t.name])
+
+
+def quick_rehearsal(
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    plan: RehearsalPlan | None = None,
+    config: DiscrepancyConfig | None = None,
+    rehearsal: RehearsalConfig | None = None,
+    tell: Tell = lambda stage: None,
+    *,
+    faster: bool = True,
+    step_error: bool = True,
+) -> dict[str, Any]:
+    """What a search in these recordings would find, as plain data (rehearsal.json).
+
+    Args:
+        scene: the robot.
+        space: all that is fitted without any effect.
+        effects: that could be hidden.
+        recordings: as given to the search.
+        plan: repeats, noise, channels and parameter values that are stated; None: as measured.
+        config: of the search.
+        rehearsal: what counts as found.
+        tell: called with each stage's name.
+        faster: whether a faster motion is looked at too.
+        step_error: whether to measure what the time step leaves, which takes another compilation.
+
+    Raises:
+        ValueError: what the search refuses too, or a simulation that blows up.
+    """
+    began = time.monotonic()
+    plan, config = plan or RehearsalPlan(), config or DiscrepancyConfig()
+    rehearsal = rehearsal or RehearsalConfig()
+    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
+    tell("tests")
+    known = answers(found, config, rehearsal)
+    model = found.model.of(found.compared)
+    other = None
+    if faster and found.model.repeated and all(r.command.size for r in recordings):
+        moved = [faster_motion(r, rehearsal.faster) for r in recordings]
+        other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
+        try:
+            with warnings.catch_warnings():  # what there is to warn of was said of the motion itself
+                warnings.simplefilter("ignore", UserWarning)
+                other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
+        except ValueError as error:
+            warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
+    tell("improvements")
+    helps = improvements(found, known, config, rehearsal, other)
+    limit = rehearsal.recovered or config.identifiability.identifiable
+    told = told_parameters(found, model)
+    of = {p.name: p for p in found.base.space.parameters}
+    at = dict(zip(found.case.full_space.names, found.base.values, strict=True))
+    return {
+        "format": "droid_jax rehearsal 1",
+        "form": "quick",
+        "recordings": [r.name for r in recordings],
+        "split": found.split.value,
+        "limits": [*filter(None, (found.split.limits, *found.case.limits))],
+        "how": {
+            "compared": list(found.compared),
+            "repeats": found.model.repeats if found.model.repeated else None,
+            "blocks": None if found.model.repeated else found.model.train.rows.units,
+            "simulated": plan.simulated,
+            "noise": [
+                dict(zip(("channel", "column", "unit", "deviation", "source"), row, strict=True))
+                for row in found.noise
+                if row[0] in found.compared
+            ],
+            "step_error": found.model.step_error,
+            "level": model.train.level,
+            "directions": len(model.directions),
+            "rehearsal": asdict(rehearsal),
+            "significance": config.selection.significance,
+            "confirmation": config.selection.confirmation,
+            "recovered_below": limit,
+        },
+        "parameters": [
+            {
+                "name": t.name,
+                "unit": of[t.name].unit,
+                "value": float(at[t.name]),
+                "nuisance": bool(of[t.name].nuisance),
+                "shrinkage": t.shrinkage,
+                "recovered": bool(t.shrinkage < limit),
+                "partners": [list(p) for p in t.partners],
+            }
+            for t in told
+        ],
+        "effects": known,
+        "helps": helps,
+        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began},
+    }
+
+
+class _Stopwatch:
+    """Seconds of each stage."""
+
+    def __init__(self, tell: Tell) -> None:
+        self.tell, self.seconds = tell, dict[str, float]()
+        self._stage, self._since = "", time.monotonic()
+
+    def __call__(self, stage: str) -> None:
+        now = time.monotonic()
+        if self._stage:
+            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._stage, self._since = stage, now
+        if stage:
+            self.tell(stage)

@@ -1,0 +1,204 @@
+"""The page of `rehearse`: what would be found, from which size, and what would help; of rehearsal.json alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from droid_jax.report.style import AFTER, BEFORE, MUTED, WIDE, inline_svg, settled, styled
+from droid_jax.report.text import counted, html, label, listed, percent, quantity
+
+Result = Mapping[str, Any]
+MOST_RIVALS = 3
+HELPS = 1.1  # times smaller, from which a change is worth a sentence
+
+
+def rehearsal_page(result: Result) -> str:
+    """HTML of a rehearsal, as its JSON holds it."""
+    figure = Markup(inline_svg(settled(smallest_figure(result)), "sizes"))
+    return html(
+        "rehearsal.html.jinja",
+        result=result,
+        sentences=rehearsal_sentences(result),
+        parameters=parameter_rows(result),
+        effects=effect_rows(result),
+        noise=noise_rows(result),
+        helps=help_rows(result),
+        how=how_sentences(result),
+        full=full_rows(result),
+        figure=figure,
+    )
+
+
+def best_of(result: Result) -> list[dict[str, Any]]:
+    """Of each effect at each place the coefficient that is found at the smallest multiple of its minimum size."""
+    best: dict[tuple[str, str], dict[str, Any]] = {}
+    for entry in result["effects"]:
+        key = (entry["effect"], entry["location"])
+        if key not in best or _multiple(entry) < _multiple(best[key]):
+            best[key] = entry
+    return sorted(best.values(), key=lambda e: (_multiple(e), e["effect"], e["location"]))
+
+
+def _multiple(entry: Mapping[str, Any]) -> float:
+    """Smallest size over the minimum effect size, or over the bound where there is no minimum."""
+    if entry["smallest"] is None:
+        return float("inf")
+    return entry["smallest"] / (entry["minimum"] or entry["bound"])
+
+
+def effect_rows(result: Result) -> list[tuple[str, ...]]:
+    """Effect, place, smallest size, what decides it, what it is taken for."""
+    rows = []
+    for e in best_of(result):
+        size = "not found" if e["smallest"] is None else quantity(e["smallest"], e["unit"], 2)
+        rows.append((label(e["effect"]), label(e["location"]), size, e["limit"], _rivals(e)))
+    return rows
+
+
+def _rivals(entry: Mapping[str, Any]) -> str:
+    said = []
+    for rival in entry["taken_for"][:MOST_RIVALS]:
+        name = f"{label(rival['effect']).lower()} at {label(rival['location']).lower()}"
+        below = rival["below"]
+        said.append(f"{name} (at any size)" if below is None else f"{name} (below {quantity(below, entry['unit'], 2)})")
+    more = len(entry["taken_for"]) - MOST_RIVALS
+    return ", ".join(said) + (f" and {more} more" if more > 0 else "")
+
+
+def parameter_rows(result: Result) -> list[tuple[str, ...]]:
+    """Name, share of the prior's width left, recovered or not, partners; nuisances are left out."""
+    return [
+        (
+            label(p["name"]),
+            percent(min(p["shrinkage"], 1.0)),
+            "yes" if p["recovered"] else "no",
+            listed([f"{label(n).lower()} ({c:+.2f})" for n, c in p["partners"]]),
+        )
+        for p in result["parameters"]
+        if not p["nuisance"]
+    ]
+
+
+def noise_rows(result: Result) -> list[tuple[str, ...]]:
+    """Channel, column, deviation of one sample, where it comes from."""
+    return [
+        (n["channel"].replace("_", " "), label(n["column"]), quantity(n["deviation"], n["unit"], 2), n["source"])
+        for n in result["how"]["noise"]
+    ]
+
+
+def help_rows(result: Result) -> list[tuple[str, ...]]:
+    """What would change, by how much sizes shrink, effects found beside, parameters recovered beside."""
+    return [
+        (
+            h["what"],
+            f"{h['times_smaller']:.2f}",
+            f"{h['newly_found'] - h['lost']:+d}",
+            f"{h['recovered_more']:+d}",
+        )
+        for h in result["helps"]
+    ]
+
+
+def full_rows(result: Result) -> list[tuple[str, ...]]:
+    """Of the complete rehearsals: effect, place, found of how many at each size."""
+    rows = []
+    for e in result.get("full", {}).get("effects", ()):
+        unit = next((q["unit"] for q in result["effects"] if q["coefficient"] == e["coefficient"]), "-")
+        sizes = ", ".join(f"{quantity(s['size'], unit, 2)}: {s['found']} of {s['cases']}" for s in e["sizes"])
+        law = "the library's" if e["same_law"] else "the synthetic robot's"
+        rows.append((label(e["effect"]), label(e["location"]), sizes, ", ".join(e["taken_for"]), law))
+    return rows
+
+
+def rehearsal_sentences(result: Result) -> list[str]:
+    """What a person can act on."""
+    best = best_of(result)
+    found = [e for e in best if e["smallest"] is not None]
+    lost = [e for e in best if e["smallest"] is None]
+    out = []
+    if found:
+        said = [f"{_thing(e)} of {quantity(e['smallest'], e['unit'], 2)}" for e in found[:3]]
+        out.append(f"With this motion {listed(said)} would be found.")
+        worst = found[-1]
+        if len(found) > 3:
+            thing = _thing(worst)
+            size = quantity(worst["smallest"], worst["unit"], 2)
+            out.append(f"{thing[:1].upper()}{thing[1:]} below {size} would not.")
+    if lost:
+        names = listed(list(dict.fromkeys(_thing(e) for e in lost))[:6])
+        out.append(f"At no size within its bounds: {names}.")
+    sure = [e for e in found if any(r["below"] is None for r in e["taken_for"])]
+    if sure:
+        e = sure[0]
+        rival = _thing(next(r for r in e["taken_for"] if r["below"] is None))
+        out.append(f"In this motion {_thing(e)} acts as {rival} does: the search will name both.")
+    main = [p for p in result["parameters"] if not p["nuisance"]]
+    missed = [label(p["name"]).lower() for p in main if not p["recovered"]]
+    out.append(
+        f"{counted(len(main) - len(missed), 'parameter')} of {len(main)} would be recovered"
+        + (f"; not {listed(missed[:6])}{' and others' if len(missed) > 6 else ''}." if missed else ".")
+    )
+    if result["helps"]:
+        h = result["helps"][0]
+        if h["times_smaller"] > HELPS or h["newly_found"] > h["lost"] or h["recovered_more"] > 0:
+            out.append(f"What would help most: {h['what']} (sizes {h['times_smaller']:.1f} times smaller).")
+        else:
+            out.append("More repeats, other channels or a faster motion would help little.")
+    return out
+
+
+def how_sentences(result: Result) -> list[str]:
+    """How it was computed."""
+    how = result["how"]
+    rows = counted(how["repeats"], "repeat") if how["repeats"] else f"{how['blocks']} blocks of time"
+    share = how["rehearsal"]["share"]
+    out = [
+        f"Compared: {listed([c.replace('_', ' ') for c in how['compared']])}, {rows} in each part.",
+        f"Found means in {share:.0%} of {how['rehearsal']['draws']} drawn noises: the score test over "
+        f"{how['directions']} coefficients has p < {how['significance']:g}, and the validation test p < "
+        f"{how['confirmation']:g}.",
+        "The residual is taken to be linear in parameters and effects, and the robot's law to be the library's.",
+        f"Recovered means that less than {percent(how['recovered_below'])} of the prior's width is left.",
+    ]
+    if how["simulated"]:
+        out.append("What was measured is replaced by what the scene makes of the commands, with this noise.")
+    return out
+
+
+def _thing(entry: Mapping[str, Any]) -> str:
+    return f"{label(entry['effect']).lower()} at {label(entry['location']).lower()}"
+
+
+@styled
+def smallest_figure(result: Result, width: float = WIDE) -> Figure:
+    """The smallest size of each effect, over its minimum effect size; one row an effect, one mark a place.
+
+    Args:
+        result: of the rehearsal.
+        width: inches.
+    """
+    places: dict[str, list[dict[str, Any]]] = {}
+    for entry in best_of(result):
+        places.setdefault(entry["effect"], []).append(entry)
+    figure = Figure(figsize=(width, 0.9 + 0.22 * max(len(places), 3)), layout="constrained")
+    axes = figure.subplots()
+    shown = [e for some in places.values() for e in some if e["smallest"] is not None]
+    far = max([_multiple(e) for e in shown], default=1.0) * 2.0
+    for row, some in enumerate(places.values()):
+        known = [_multiple(e) for e in some if e["smallest"] is not None]
+        if known:
+            axes.plot([min(known), max(known)], [row, row], color=AFTER, linewidth=1.0)
+            axes.plot(known, [row] * len(known), "o", color=AFTER, markersize=4, linestyle="none")
+        if len(known) < len(some):
+            axes.plot([far], [row], marker=">", color=BEFORE, markersize=5, linestyle="none")
+    axes.axvline(1.0, color=MUTED, linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(places)), [label(name) for name in places])
+    axes.invert_yaxis()
+    axes.set_xlabel("smallest size that is found, times the minimum effect size (triangle: not found)")
+    return figure
