@@ -3,7 +3,8 @@
     python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--out DIR] [--runs DIR]
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
-its torques too, searched by windows (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.  Hidden
+its torques too, searched by stretches of
+time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.  Hidden
 effects are 3 and 10 times their minimum effect size.  One small JSON a case under RUNS: the run can be stopped and goes
 on where it was, and the same command started twice shares the cases.
 """
@@ -66,6 +67,7 @@ from experiments.blind.search import FAILED  # noqa: E402
 from experiments.trials import answer_json  # noqa: E402
 
 SECONDS = 24.0
+HELD = 1.5  # s, before that: the robot settles where its servos hold it, and no log begins with a jolt
 NOISE = 1e-4  # rad, of a position sample
 FACTORS = (3.0, 10.0)  # of the minimum effect size
 STROKES = ((3.0, 0.9), (5.0, 0.9), (4.6, 0.8), (3.4, 0.95), (2.6, 0.75), (5.4, 0.85))  # s and rad, there and back
@@ -148,13 +150,13 @@ class Plan:
 
 def bench(scene: str, channels: str) -> Bench:
     """Of a scene and a set of channels."""
-    compared, clock = CHANNELS[channels], np.arange(0.0, SECONDS, 0.004)
+    compared, clock = CHANNELS[channels], np.arange(0.0, HELD + SECONDS, 0.004)
     if scene == "hinge":
         where = setting("hinge")
-        model, base, joints, command = where.scene, where.base, (DOOR,), _strokes(clock)[:, None]
+        model, base, joints, command = where.scene, where.base, (DOOR,), _strokes(clock - HELD)[:, None]
     else:
         model = ready(compile_scene(mujoco.MjSpec.from_string(ARM), "arm", joints=JOINTS))
-        base, joints, command = _arm_base(model), JOINTS, _waves(clock)
+        base, joints, command = _arm_base(model), JOINTS, _waves(np.maximum(clock - HELD, 0.0))
     if "torque" not in compared:
         base = Space(tuple(p for p in base.parameters if not p.name.startswith("torque_offset")))
     start = dict(zip(joints, command[0].tolist(), strict=True))
@@ -223,7 +225,7 @@ def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | 
         trace = simulate(robot.scene, robot.models, robot.qpos0, robot.control[None])
         log = as_recording(robot, trace, sensor_torque(robot, trace), trace.position, name=plan.name)
     kept = {name: log.channels[name] for name in ("position", *bench.channels)}
-    return replace(log, channels=kept), hidden
+    return replace(log, channels=kept).window(HELD, HELD + SECONDS), hidden
 
 
 def _minimum(bench: Bench, kind: str, joint: str) -> float:
