@@ -3,10 +3,9 @@
     python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--out DIR] [--runs DIR]
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
-its torques too, searched by stretches of
-time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.  Hidden
-effects are 3 and 10 times their minimum effect size.  One small JSON a case under RUNS: the run can be stopped and goes
-on where it was, and the same command started twice shares the cases.
+its torques too, searched by stretches of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
+Hidden effects are 3 and 10 times their minimum effect size.  One small JSON a case under RUNS: the run can be stopped
+and goes on where it was, and the same command started twice shares the cases.
 """
 
 from __future__ import annotations
