@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from commanded_fit import HERE, command, kept
 from inverse_fit import RESULTS, run
@@ -60,6 +61,12 @@ def fold(config: GapXl330, paths: dict[str, Path], judge: int, motions: tuple[st
         "limits": found["split"]["limits"],
         "coefficients": found["coefficients"],
         "discrepancies": found["discrepancies"],
+        "mae_judged_rad": {
+            state: float(
+                np.mean([found["open_loop"]["errors"][path.stem]["position"][f"mae_{state}"] for path in test])
+            )
+            for state in ("before", "after")
+        },
         "discretisation_error": found["discretisation_error"],
         "ranking": found["score_tests"][0]["ranking"][:6],
         "validation_tests": found["validation_tests"],
@@ -78,10 +85,20 @@ def main(config: GapXl330) -> None:
         "source": SOURCE,
         "recordings": {r.name: r.sha256 for r in logs},
         "verdicts": {f"kp{of['judge_kp']}": of["sentence"] for of in folds},
+        "mae_judged_rad": {
+            state: float(np.mean([of["mae_judged_rad"][state] for of in folds])) for state in ("before", "after")
+        },
         "folds": folds,
         "seconds": round(sum(of["seconds"] for of in folds), 1),
     }
-    common.publish(config.out, "gap_xl330", config.quick, config.seed, result, line={"verdicts": result["verdicts"]})
+    common.publish(
+        config.out,
+        "gap_xl330",
+        config.quick,
+        config.seed,
+        result,
+        line={key: result[key] for key in ("verdicts", "mae_judged_rad")},
+    )
 
 
 if __name__ == "__main__":
