@@ -95,7 +95,7 @@ def warp_case(folder: Path, mjcf: Path, worlds: int, seconds: float) -> dict[str
         def step(ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             data.ctrl.assign(np.tile(ctrl, (worlds, 1)))
             mjw.step(there, data)
-            return data.qpos.numpy(), data.qfrc_actuator.numpy()
+            return data.qpos.numpy().copy(), data.qfrc_actuator.numpy().copy()  # else views of the next step
 
         return step
 

@@ -109,7 +109,7 @@ def test_a_batch_holds_the_draws_that_apply_writes(made: Made):
     for k in range(5):
         one = mujoco.MjModel.from_xml_path(str(SCENE))
         apply_fit.apply(one, made.fit, sample=k, seed=2)
-        for name in (n for n in dir(one) if n.split("_")[0] in ("body", "jnt", "dof", "geom", "actuator", "tendon")):
+        for name in (n for n in dir(one) if n.startswith(("body_", "jnt_", "dof_", "geom_", "actuator_", "tendon_"))):
             written = fields[name][k] if name in fields else getattr(model, name)
             np.testing.assert_allclose(written, getattr(one, name), rtol=1e-9, atol=1e-12, err_msg=name)
     assert np.ptp(fields["body_mass"], axis=0).max() > 0.1
