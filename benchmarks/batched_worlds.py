@@ -43,9 +43,11 @@ def commands(model: mujoco.MjModel, seconds: float) -> np.ndarray:
     return out
 
 
-def in_c(models: list[mujoco.MjModel], command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def in_c(models: list[mujoco.MjModel], start: np.ndarray, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T, W, nq] and actuators' forces [T, W, nv] after each step."""
     datas = [mujoco.MjData(model) for model in models]
+    for data in datas:
+        data.qpos[:] = start  # a fitted qpos0 differs between the worlds
     qpos, force = [], []
     for ctrl in command:
         for model, data in zip(models, datas, strict=True):
@@ -56,9 +58,9 @@ def in_c(models: list[mujoco.MjModel], command: np.ndarray) -> tuple[np.ndarray,
     return np.array(qpos), np.array(force)
 
 
-def compared(step: Step, models: list[mujoco.MjModel], command: np.ndarray) -> dict[str, float]:
+def compared(step: Step, models: list[mujoco.MjModel], start: np.ndarray, command: np.ndarray) -> dict[str, float]:
     """Largest difference of worlds and C models, and the largest between two worlds in C."""
-    qpos, force = in_c(models, command)
+    qpos, force = in_c(models, start, command)
     own = [step(ctrl) for ctrl in command]
     out = {"worlds": len(models), "steps": len(command)}
     for name, there, here in (("position", qpos, [o[0] for o in own]), ("force", force, [o[1] for o in own])):
@@ -84,13 +86,14 @@ def warp_case(folder: Path, mjcf: Path, worlds: int, seconds: float) -> dict[str
 
     apply_fit = importlib.import_module("apply_fit")
     model, fit = mujoco.MjModel.from_xml_path(str(mjcf)), apply_fit.load(folder / "fitted.json")
-    command = commands(model, seconds)
+    command, start = commands(model, seconds), model.qpos0.copy()
 
     def stepper(fields: dict[str, np.ndarray]) -> Step:
         there = mjw.put_model(model, batch_sizes={name: worlds for name in fields})
         for name, rows in fields.items():
             getattr(there, name).assign(rows)
         data = mjw.make_data(model, nworld=worlds)
+        data.qpos.assign(np.tile(start, (worlds, 1)))
 
         def step(ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             data.ctrl.assign(np.tile(ctrl, (worlds, 1)))
@@ -102,9 +105,9 @@ def warp_case(folder: Path, mjcf: Path, worlds: int, seconds: float) -> dict[str
     with wp.ScopedDevice("cpu"):
         fields = apply_fit.batch(model, fit, worlds, SEED)
         fields = {name: rows for name, rows in fields.items() if hasattr(mjw.put_model(model), name)}
-        draws = compared(stepper(fields), drawn(apply_fit, model, fit, worlds), command)
+        draws = compared(stepper(fields), drawn(apply_fit, model, fit, worlds), start, command)
         apply_fit.apply(model, fit)
-        alone = compared(stepper({}), [model] * worlds, command)
+        alone = compared(stepper({}), [model] * worlds, start, command)
     return {"fields": sorted(fields), "draws": draws, "fitted_values": alone, **versions("mujoco-warp", "warp-lang")}
 
 
@@ -147,16 +150,16 @@ def mjlab_case(folder: Path, mjcf: Path, worlds: int, seconds: float) -> dict[st
 
     env = environment(fit=mjlab_terms.fitted("robot", draws=worlds, seed=SEED))
     model = env.sim.mj_model
-    command = commands(model, seconds)
+    command, start = commands(model, seconds), env.sim.data.qpos.numpy()[0].copy()
     models = drawn(apply_fit, model, fit, worlds)
-    draws = compared(stepper(env), models, command)
+    draws = compared(stepper(env), models, start, command)
     fields = list(env.event_manager.domain_randomization_fields)
     written = 0.0  # largest difference of a field of the worlds' models, as a share of the field's largest number
     for name in fields:
         expected = np.array([getattr(each, name) for each in models])
         error = np.abs(getattr(env.sim.model, name).numpy() - expected).max()
         written = max(written, float(error / np.abs(expected).max()))
-    alone = compared(stepper(environment()), [model] * worlds, command)
+    alone = compared(stepper(environment()), [model] * worlds, start, command)
     found = {"fields": fields, "fields_relative_error": written, "draws": draws, "fitted_values": alone}
     return {**found, **versions("mjlab", "mujoco-warp", "torch")}
 
