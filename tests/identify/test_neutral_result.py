@@ -117,9 +117,10 @@ def test_a_batch_holds_the_draws_that_apply_writes(made: Made):
 
 def test_a_batch_finds_the_robot_in_a_larger_scene(made: Made):
     """Under a prefix; a nameless element, whose number is another there, is refused."""
-    scene = mujoco.MjSpec()
+    scene, robot = mujoco.MjSpec(), mujoco.MjSpec.from_file(str(SCENE))
+    scene.option = robot.option
     scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
-    scene.attach(mujoco.MjSpec.from_file(str(SCENE)), prefix="robot/", frame=scene.worldbody.add_frame(pos=[2, 0, 0]))
+    scene.attach(robot, prefix="robot/", frame=scene.worldbody.add_frame(pos=[2, 0, 0]))
     model, alone = scene.compile(), mujoco.MjModel.from_xml_path(str(SCENE))
     there, here = apply_fit.batch(model, made.fit, 3, prefix="robot/"), apply_fit.batch(alone, made.fit, 3)
     joint, own = model.joint("robot/door").dofadr[0], alone.joint("door").dofadr[0]
