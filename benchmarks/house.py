@@ -88,7 +88,8 @@ def gap_modules() -> dict[str, list[str]]:
 
     runtime.tune()
     for module in pkgutil.walk_packages(droid_jax.__path__, "droid_jax."):
-        if not module.name.startswith("droid_jax.policy"):  # which needs brax, and is no part of it
+        # Not what needs brax, or mjlab beside a run's files; neither is part of it.
+        if not module.name.startswith(("droid_jax.policy", "droid_jax.identify.mjlab_terms")):
             importlib.import_module(module.name)
     import small_gap
 

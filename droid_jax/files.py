@@ -5,7 +5,9 @@ GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"
 TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distribution.npz"
 HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
-FITTED_JSON, APPLY_FIT = "fitted.json", "apply_fit.py"  # a fit for programs that have MuJoCo and not this one
+# A fit for programs that have MuJoCo and not this one.
+NEUTRAL = FITTED_JSON, APPLY_FIT, MJLAB_TERMS = "fitted.json", "apply_fit.py", "mjlab_terms.py"
+VIEWER = "viewer.html"  # measured and simulated motion in a browser
 ASKED = "all.json"  # the options of a run of all stages, beside their folders
 GAP, GAP_TRACES = "gap.json", "gap.npz"
 FIT_VERSION, GAP_VERSION = 3, 2  # of fit.json and gap.json
@@ -26,7 +28,7 @@ LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
 # What else is in them that would be taken for the next run's.
 RESULTS = {
     "identify": (FIT, GAUSSIAN, EXTENDED),
-    "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF, "extended.patch", "extended_parts", FITTED_JSON, APPLY_FIT),
+    "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF, "extended.patch", "extended_parts", *NEUTRAL),
     "train": (POLICY, TRANSFER, EXTENDED, FILMS, "export"),
 }
 # Held while a run writes to the folder; not there otherwise.
@@ -37,6 +39,6 @@ WRITTEN: dict[str, tuple[str, ...]] = {
     for stage, last in LAST_FILES.items()
 }
 WRITTEN["identify"] += ("gaussian_full.json", SAMPLES, TRACES, CORRELATION, DISTRIBUTION, HISTORY, HISTORY_TABLE)
-WRITTEN["identify"] += (FITTED, "fitted.patch", "fitted_parts", FITTED_JSON, APPLY_FIT, REPLAY, FILMS, "frames")
+WRITTEN["identify"] += (FITTED, "fitted.patch", "fitted_parts", *NEUTRAL, REPLAY, FILMS, "frames", VIEWER)
 WRITTEN["train"] += (GAUSSIAN,)
 WRITTEN["all"] = (ASKED, "report.html")

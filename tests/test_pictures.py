@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,13 @@ import pytest
 
 from droid_jax.commands import identify
 from droid_jax.commands.identify import Identify
-from droid_jax.commands.pictures import draw_replay, keep_replay
+from droid_jax.commands.pictures import draw_replay, keep_replay, measured_states
 from droid_jax.model.scene import Scene, load_scene
-from droid_jax.recordings.recording import Recording
-from droid_jax.report import page, render
+from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.report import page, render, viewer
 from droid_jax.storage import write_npz
 
-OLD = ("frames/after_00_0.0s.png", "films/replay.webp", "replay.npz")
+OLD = ("frames/after_00_0.0s.png", "films/replay.webp", "replay.npz", "viewer.html")
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +37,54 @@ def test_a_log_without_commands_leaves_no_pictures_of_an_earlier_fit(tmp_path: P
     assert [name for name in OLD if (tmp_path / name).exists()] == []
 
 
+def test_the_measured_motion_is_the_mean_of_what_was_measured(scene: Scene):
+    """On the replay's clock, joint by joint; a joint that was not measured stands as it was simulated."""
+    joint, other = scene.joints[:2]
+    clock = np.array([1.0, 2.0, 3.0])
+    values = np.array([[[0.0], [1.0], [2.0]], [[0.0], [3.0], [9.0]]])
+    mask = np.array([[[True], [True], [True]], [[True], [True], [False]]])
+    channel = Channel("position", "rad", (joint,), clock, values, mask)
+    log = Recording("log", clock, np.zeros((3, 1)), (joint,), {"position": channel}, None)  # type: ignore[arg-type]
+    found = measured_states(scene, log, np.array([0.0, 0.5, 2.0]), np.full((3, scene.model.nq), 7.0))
+    assert found["measured_joints"].tolist() == [joint] and found["start"] == 1.0
+    np.testing.assert_allclose(found["measured"][:, scene.qpos(joint)], [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(found["measured"][:, scene.qpos(other)], 7.0)
+    unmeasured = Channel("position", "rad", (joint,), clock, values, np.zeros_like(mask))
+    log = Recording("log", clock, np.zeros((3, 1)), (joint,), {"position": unmeasured}, None)  # type: ignore[arg-type]
+    assert measured_states(scene, log, np.zeros(3), np.zeros((3, scene.model.nq))) == {}
+
+
+def test_the_viewer_holds_pictures_and_residuals_of_every_joint(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of the measurement and both simulations; older replays, without a measurement, show the simulations."""
+    asked = list[np.ndarray]()
+
+    def drawn(model, states, rows, camera, size):
+        asked.append(states)
+        return [np.zeros((4, 6, 3), np.uint8) for _ in rows]
+
+    monkeypatch.setattr(viewer, "rendered_frames", drawn)
+    states = np.linspace(0.0, 1.0, 5)[:, None] * np.ones(scene.model.nq)
+    joints = np.array(scene.joints)
+    write_npz(
+        tmp_path / "replay.npz",
+        {"time": np.arange(5) / 25.0, "before": 2 * states, "after": states, "measured": states - 0.5,
+         "measured_joints": joints, "recording": np.array("</script>"), "start": np.array(0.0)},
+    )  # fmt: skip
+    text = viewer.write_viewer(tmp_path, scene.model).read_text()
+    assert len(asked) == 3 and "</script>" not in text.replace("</script>\n</body>", "")
+    data = json.loads(text.split("const data = ")[1].split(";\n")[0])
+    assert {side: len(uris) for side, uris in data["pictures"].items()} == {"measured": 3, "before": 3, "after": 3}
+    assert data["time"] == [0.0, 0.08, 0.16] and len(data["series"]) == len(joints)
+    assert data["series"][0]["measured"] == [-0.5, -0.25, 0.0, 0.25, 0.5] and data["series"][0]["unit"] == "rad"
+    asked.clear()
+    replay(tmp_path, states)
+    text = viewer.write_viewer(tmp_path, scene.model, None, [np.zeros((4, 6, 3), np.uint8)] * 3).read_text()
+    assert not asked and "No joint's position is known" in text
+    assert set(json.loads(text.split("const data = ")[1].split(";\n")[0])["pictures"]) == {"before", "after"}
+
+
 def test_what_could_not_be_drawn_is_drawn_later_and_once(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -48,6 +97,7 @@ def test_what_could_not_be_drawn_is_drawn_later_and_once(
 
     monkeypatch.setattr(render, "rendered_frames", drawn)
     monkeypatch.setattr(render, "film", lambda path, model, sides, period, camera: asked.append(period))
+    monkeypatch.setattr(viewer, "write_viewer", lambda *_: None)
     draw_replay(tmp_path, scene)  # nothing to draw
     replay(tmp_path, np.zeros((5, scene.model.nq)))
     draw_replay(tmp_path, scene)

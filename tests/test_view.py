@@ -6,17 +6,22 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import urllib.request
 from collections.abc import Iterator
+from http.server import ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
-from droid_jax.commands.view import replay_of, side_by_side
+from droid_jax.commands import view
+from droid_jax.commands.view import page_of, replay_of, serve, side_by_side
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
-from droid_jax.files import FITTED, REPLAY
+from droid_jax.files import FITTED, REPLAY, VIEWER
 from droid_jax.model.mjcf import fitted_mjcf
 from droid_jax.run import main
 
@@ -122,6 +127,47 @@ def test_without_a_path_it_shows_what_the_default_command_left(
         monkeypatch.delenv(name, raising=False)
     assert main(["view"]) == 2
     assert f"a film in {Path('runs/all/identify/report.html')}" in capsys.readouterr().err
+
+
+def test_the_page_is_served_until_it_is_interrupted(monkeypatch: pytest.MonkeyPatch, capsys):
+    """At this machine's own address, at a free port, whatever path is asked for."""
+    servers = list[ThreadingHTTPServer]()
+
+    class Kept(ThreadingHTTPServer):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            servers.append(self)
+
+    monkeypatch.setattr(view, "ThreadingHTTPServer", Kept)
+    thread = threading.Thread(target=serve, args=(b"<p>page</p>", "127.0.0.1", 0))
+    thread.start()
+    while not servers:
+        thread.join(0.01)
+    host, port = servers[0].server_address[:2]
+    assert host == "127.0.0.1"
+    for path in ("", "anything"):
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=10) as answer:
+            assert answer.read() == b"<p>page</p>" and answer.headers["Content-Type"].startswith("text/html")
+    with pytest.raises(ValueError, match=f"--port {port}: .*choose another --port"):
+        serve(b"", "127.0.0.1", port)
+    servers[0].shutdown()
+    thread.join(10)
+    assert not thread.is_alive() and f"ssh -L {port}:127.0.0.1:{port}" in capsys.readouterr().out
+
+
+def test_a_page_that_is_there_is_not_drawn_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One that is not is drawn first; a port that is none is refused."""
+    drawn = list[Path]()
+
+    def write(where: Path, model: mujoco.MjModel) -> None:
+        drawn.append(where)
+        (where / VIEWER).write_bytes(b"drawn")
+
+    monkeypatch.setattr("droid_jax.report.viewer.write_viewer", write)
+    shutil.copytree(folder, tmp_path / "run")
+    assert [page_of(tmp_path / "run") for _ in range(2)] == [b"drawn", b"drawn"] and drawn == [tmp_path / "run"]
+    with pytest.raises(ValueError, match="from 0 to 65535, got 70000"):
+        view.run(view.View(tmp_path / "run", port=70000))
 
 
 def test_a_folder_without_a_replay_is_refused(tmp_path: Path, capsys):

@@ -1,4 +1,4 @@
-"""Pictures of a fit: the replay before and after it, as states, film and frames."""
+"""Pictures of a fit: the measured motion, the replay before and after it, as states, film, frames and viewer."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from droid_jax import distributed
-from droid_jax.files import FILMS, REPLAY, REPLAY_FILM
+from droid_jax.files import FILMS, REPLAY, REPLAY_FILM, VIEWER
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from droid_jax.identify.pipeline import Identified
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
@@ -21,7 +23,7 @@ FRAMES = "frames"
 
 
 def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
-    """Replay a recording's commands in plain C before and after the fit, into replay.npz.
+    """Replay a recording's commands in plain C before and after the fit, into replay.npz, beside the measured motion.
 
     It and the pictures of an earlier fit in this folder are removed first.  A recording without commands has no replay
     to show.
@@ -42,16 +44,47 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     models = (scale_gains(make_c_model(found.scene, found.full, v), factors) for v in (found.start, found.best))
     before, after = (poses(model, drive.qpos0, drive.command)[::every] for model in models)
     time = drive.timestep * every * np.arange(len(after))
-    write_npz(out / REPLAY, {"time": time, "before": before, "after": after})
+    states = {"time": time, "before": before, "after": after, "recording": np.array(recording.name)}
+    write_npz(out / REPLAY, {**states, **measured_states(found.scene, recording, time, after)})
+
+
+def measured_states(scene: Scene, recording: Recording, time: np.ndarray, else_: np.ndarray) -> dict[str, np.ndarray]:
+    """What a replay's file says of the measured motion; empty where no joint's position was measured.
+
+    Args:
+        scene: that was replayed.
+        recording: mean of its repeats.
+        time: [K] s after the first command.
+        else_: [K, nq] positions of joints that were not measured.
+
+    Returns:
+        `measured` [K, nq], the names of the `measured_joints`, and `start`, the first command's time, s.
+    """
+    import numpy as np
+
+    from droid_jax.recordings.recording import POSITION_CHANNELS
+
+    states, joints, start = else_.copy(), list[str](), float(recording.time[0])
+    for channel in (recording.channels[name] for name in POSITION_CHANNELS if name in recording.channels):
+        for c, joint in enumerate(channel.columns):
+            values, mask = channel.values[:, :, c], channel.mask[:, :, c]
+            there = mask.any(axis=0)
+            if there.sum() < 2 or joint not in scene.single_joints:
+                continue
+            mean = np.where(mask, values, 0.0).sum(axis=0)[there] / mask.sum(axis=0)[there]
+            states[:, scene.qpos(joint)] = np.interp(start + time, channel.time[there], mean)
+            joints.append(joint)
+    return {"measured": states, "measured_joints": np.array(joints), "start": np.array(start)} if joints else {}
 
 
 def draw_replay(out: Path, scene: Scene) -> None:
-    """Draw what replay.npz holds, as film and frames, where there is one that was not drawn yet.
+    """Draw what replay.npz holds, as film, frames and viewer, where there is one that was not drawn yet.
 
     Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
     """
     from droid_jax.report.reading import Reader, read_replay
     from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
+    from droid_jax.report.viewer import write_viewer
     from droid_jax.storage import new_folder
 
     if not distributed.first() or not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
@@ -63,7 +96,8 @@ def draw_replay(out: Path, scene: Scene) -> None:
         rows = [int(f * (len(after) - 1)) for f in AT]
         images = rendered_frames(model, after, rows, camera)
         period = float(time[1]) if len(time) > 1 else 1.0 / RATE
-        film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
+        drawn = film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
+        write_viewer(out, model, camera, drawn)
     except (NoOpenGL, ValueError) as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
@@ -73,6 +107,6 @@ def draw_replay(out: Path, scene: Scene) -> None:
 
 def _forget(out: Path) -> None:
     """Remove the pictures of an earlier fit."""
-    for path in (out / REPLAY, out / FILMS / REPLAY_FILM):
+    for path in (out / REPLAY, out / FILMS / REPLAY_FILM, out / VIEWER):
         path.unlink(missing_ok=True)
     shutil.rmtree(out / FRAMES, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""`view`: a fit's replay in MuJoCo's viewer, before and after side by side."""
+"""`view`: a fit's replay in MuJoCo's viewer, before and after side by side, or in a browser beside the measurement."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from droid_jax.commands.folder import stage_folder
-from droid_jax.files import FITTED, REPLAY
+from droid_jax.files import FITTED, REPLAY, VIEWER
 
 if TYPE_CHECKING:
     import mujoco
@@ -26,16 +27,26 @@ APART = 1.6  # times the scene's extent between the two
 
 @dataclass(frozen=True)
 class View:
-    """Watch the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen."""
+    """Watch the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen.
+
+    With --port it is a page for a browser instead: the measured motion beside both, a slider, and the residuals of
+    every joint.
+    """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of `identify` or of `all`. Default: runs/identify where it holds a replay, else runs/all."""
     speed: float = 1.0
-    """Times real time."""
+    """Times real time, in MuJoCo's viewer."""
+    port: int | None = None
+    """Serve the page for a browser at this port until Ctrl-C; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Address that the page is served at. The default can be reached from this machine alone, or by `ssh -L`."""
 
 
 def run(command: View) -> None:
-    """Play the states of replay.npz over and over until the window is closed."""
+    """Play the states of replay.npz over and over until the window is closed, or serve the viewer's page."""
+    if command.port is not None and not 0 <= command.port < 65536:
+        raise ValueError(f"--port must be a number from 0 to 65535, got {command.port}")
     if not command.speed > 0:
         raise ValueError(f"--speed must be above 0, got {command.speed:g}")
     folder = stage_folder(command.run, "identify", REPLAY)
@@ -44,8 +55,14 @@ def run(command: View) -> None:
             f"{folder} holds no {REPLAY}: `python -m droid_jax.run identify` writes one for recordings that hold "
             "commands"
         )
+    if command.port is not None:
+        serve(page_of(folder), command.host, command.port)
+        return
     if not _opens():
-        raise ValueError(f"no window can be opened here; the same replay is a film in {folder / 'report.html'}")
+        raise ValueError(
+            f"no window can be opened here; the same replay is a film in {folder / 'report.html'}, "
+            "and with --port 8080 a page for a browser"
+        )
     import mujoco
 
     clock, states = replay_of(folder)
@@ -61,6 +78,51 @@ def run(command: View) -> None:
             mujoco.mj_forward(model, data)
             window.sync()
             time.sleep(0.02)
+
+
+def page_of(folder: Path) -> bytes:
+    """The viewer's page of a fit's folder; drawn first where `identify` could not, or an older version had none."""
+    if not (folder / VIEWER).is_file():
+        import mujoco
+
+        from droid_jax.report.render import NoOpenGL
+        from droid_jax.report.viewer import write_viewer
+
+        print("drawing the pictures ...", flush=True)
+        try:
+            write_viewer(folder, mujoco.MjModel.from_xml_path(str(folder / FITTED)))
+        except NoOpenGL as error:
+            raise ValueError(str(error)) from None
+    return (folder / VIEWER).read_bytes()
+
+
+def serve(page: bytes, host: str, port: int) -> None:
+    """Serve one page at every path until Ctrl-C.
+
+    Raises ValueError where the port cannot be had.
+    """
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(page)))
+            self.end_headers()
+            with contextlib.suppress(ConnectionError):  # the browser left
+                self.wfile.write(page)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    try:
+        server = ThreadingHTTPServer((host, port), Page)
+    except OSError as error:
+        raise ValueError(f"--host {host} --port {port}: {error.strerror or error}; choose another --port") from None
+    with server, contextlib.suppress(KeyboardInterrupt):
+        port = server.server_address[1]
+        print(f"open http://{host}:{port} in a browser; Ctrl-C ends it")
+        print(f"from another machine: ssh -L {port}:{host}:{port} USER@THIS_MACHINE, then the same address", flush=True)
+        server.serve_forever()
 
 
 def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -13,12 +13,14 @@
         laws(model, data)                                   # a latch, a friction that goes with the load
         mujoco.mj_step(model, data)
 
-`mujoco.set_mjcb_control(laws)` serves in place of `laws(model, data)`.  fitted.json says what its entries mean
-(docs/results-folder.md of droid_jax).  Draw `k` of a seed is the same wherever and how often it is asked for.
+`mujoco.set_mjcb_control(laws)` serves in place of `laws(model, data)`.  `batch(model, fit, 4096)` gives draws as arrays
+by field, for engines that step many worlds.  fitted.json says what its entries mean (docs/results-folder.md of
+droid_jax).  Draw `k` of a seed is the same wherever and how often it is asked for.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import warnings
@@ -31,12 +33,16 @@ import numpy as np
 
 FORMAT, VERSION = "droid_jax fitted", 1
 TRIES, SWEEPS = 2000, 40  # rows drawn until one is within the bounds; after that rounds of Gibbs sampling
+FIRST_TRIES = 20  # of these, which mostly suffice
+ALIKE = 1e-9  # relative: what mj_setConst works out anew of the same numbers differs by rounding
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
 _UNIT = ("body_quat", "jnt_axis", "geom_quat")
 _DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
              "jnt_axis", "geom_pos", "geom_quat"}  # fmt: skip
 _WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
 _PLACE = {"body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size"}
+_OF_ELEMENTS = ("body_", "jnt_", "dof_", "qpos", "geom_", "site_", "pair_", "actuator_", "tendon_", "eq_", "cam_",
+                "light_")  # fmt: skip
 _SURE = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
          "actuator_gainprm", "actuator_biasprm")  # fmt: skip
 
@@ -75,6 +81,43 @@ def apply(
     return values
 
 
+def batch(
+    model: mujoco.MjModel, fit: dict[str, Any] | str | Path, count: int, seed: int = 0, prefix: str = ""
+) -> dict[str, np.ndarray]:
+    """Draws as arrays by field of the model, for engines that step many worlds with numbers of their own.
+
+    Args:
+        model: compiled, of the MJCF that was fitted or of a scene that holds it.  It is not changed.
+        fit: content of fitted.json, or its path.
+        count: draws, at least 1; row k is what `apply(model, fit, sample=k, seed=seed)` writes.
+        seed: of the draws.
+        prefix: before the names of the fitted MJCF's elements in this scene, "robot/".
+
+    Returns:
+        {field: [count, *shape of the field]} of the fields that differ from the model's in a draw: what is written,
+        and what MuJoCo derives from it (`dof_invweight0`).  The laws of `forces` are in none of them.
+
+    Raises:
+        ValueError: count is below 1, or the model lacks an element of the fit.
+    """
+    fit = fit if isinstance(fit, dict) else load(fit)
+    if count < 1:
+        raise ValueError(f"batch: count must be at least 1, got {count}")
+    if prefix:
+        if nameless := sorted({f"{row['element']} {row['id']}" for row in fit["table"] if not row["name"]}):
+            raise ValueError(f"{', '.join(nameless)}: give it a name in the MJCF and fit again to find it by a prefix")
+        fit = {**fit, "table": [{**row, "name": prefix + row["name"]} for row in fit["table"]]}
+    written, names = copy.copy(model), [p["name"] for p in fit["parameters"]]
+    old = {field: getattr(model, field) for field in dir(model) if field.startswith(_OF_ELEMENTS)}
+    old = {field: array for field, array in old.items() if np.asarray(array).dtype.kind == "f"}
+    new = {field: np.empty((count, *array.shape)) for field, array in old.items()}
+    for k, row in enumerate(draws(fit, range(count), seed).tolist()):
+        _write(written, fit, dict(zip(names, row, strict=True)))
+        for field, rows in new.items():
+            rows[k] = getattr(written, field)
+    return {field: rows for field, rows in new.items() if not np.allclose(rows, old[field], rtol=ALIKE, atol=1e-12)}
+
+
 def fitted_values(fit: dict[str, Any]) -> dict[str, float]:
     """The fitted values by parameter."""
     return {p["name"]: p["value"] for p in fit["parameters"]}
@@ -96,9 +139,14 @@ def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
     out = np.empty((len(samples), len(mean)))
     for i, sample in enumerate(samples):
         rng = np.random.default_rng([seed, sample])
-        rows = mean + rng.standard_normal((TRIES, len(mean))) @ root.T
-        inside = np.flatnonzero(np.all((rows >= low) & (rows <= high), axis=1))
-        out[i] = rows[inside[0]] if len(inside) else _gibbs(rng, mean, cov, low, high)
+        for tries in (FIRST_TRIES, TRIES - FIRST_TRIES):
+            rows = mean + rng.standard_normal((tries, len(mean))) @ root.T
+            inside = np.flatnonzero(np.all((rows >= low) & (rows <= high), axis=1))
+            if len(inside):
+                out[i] = rows[inside[0]]
+                break
+        else:
+            out[i] = _gibbs(rng, mean, cov, low, high)
     return np.stack([_physical(p, out[:, i], physical) for i, p in enumerate(parameters)], axis=1)
 
 

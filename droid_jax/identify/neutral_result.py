@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from droid_jax.files import APPLY_FIT, FITTED_JSON
+from droid_jax.files import APPLY_FIT, FITTED_JSON, MJLAB_TERMS
 from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.effect_interface import Effect
@@ -49,7 +49,7 @@ def write_neutral(
     main: str,
     checks: Mapping[str, Any] | None = None,
 ) -> str:
-    """Write the MJCF with the fitted values, fitted.json and apply_fit.py into a folder.
+    """Write the MJCF with the fitted values, fitted.json, apply_fit.py and mjlab_terms.py into a folder.
 
     Args:
         folder: of the results.
@@ -78,7 +78,9 @@ def write_neutral(
         write_text(patch, made.patch)
     content = neutral_json(scene, gaussian, values, effects, made, error, checks or {})
     write_text(folder / FITTED_JSON, _lines(content))
-    write_bytes(folder / APPLY_FIT, Path(apply_fit.__file__).read_bytes())
+    own = Path(apply_fit.__file__)
+    write_bytes(folder / APPLY_FIT, own.read_bytes())
+    write_bytes(folder / MJLAB_TERMS, own.with_name(MJLAB_TERMS).read_bytes())  # read, since few have what it imports
     return error
 
 

@@ -22,6 +22,7 @@ from droid_jax.files import (
     REPLAY,
     REPLAY_FILM,
     TRACES,
+    VIEWER,
 )
 from droid_jax.read_json import parse_json
 from droid_jax.report.neutral_folder import Neutral, read_neutral
@@ -266,6 +267,11 @@ class Run:
     frames: tuple[Path, ...]
     film: Path | None
     replay: bool
+
+    @property
+    def viewer(self) -> Path | None:
+        """Page of measured and simulated motion side by side, None when missing."""
+        return self.folder / VIEWER if (self.folder / VIEWER).is_file() else None
 
     @property
     def neutral(self) -> Neutral | None:

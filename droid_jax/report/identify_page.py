@@ -51,6 +51,7 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
         "judges": [gap.judged for gap in run.fit.heldout_distances.values() for _ in gap.channels],
         "frames": frame_rows(run.frames),
         "replay": data_uri(run.film.read_bytes(), "webp") if run.film else None,
+        "viewer": run.viewer,
     }
 
 

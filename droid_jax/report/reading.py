@@ -110,6 +110,19 @@ def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.nd
     return time, before, after
 
 
+def read_measured(path: Path, read: Reader) -> tuple[str, float, np.ndarray, list[str]]:
+    """Of a replay.npz its recording's name, when its commands begin [s], the measured positions [K, nq] and whose
+    they are; without a joint where none was measured, or where an older version wrote the file."""
+    names = ("recording", "start", "measured", "measured_joints")
+    found = read.arrays(path, ("time", "after"), names, texts=("recording", "measured_joints"))
+    if not all(name in found for name in names):
+        return str(found.get("recording", "")), 0.0, found["after"], []
+    read.shaped(found["measured"], found["after"].shape, f"{path}, measured")
+    read.shaped(found["start"], (), f"{path}, start")
+    read.shaped(found["measured_joints"], (None,), f"{path}, measured_joints")
+    return str(found["recording"]), float(found["start"]), found["measured"], found["measured_joints"].tolist()
+
+
 class FindingEntry(Struct, frozen=True):
     """What a check of a recording found (`preflight.findings`)."""
 

@@ -99,10 +99,11 @@ def save_image(path: Path, image: np.ndarray) -> None:
 
 def film(
     path: Path, model: mujoco.MjModel, sides: Sequence[np.ndarray], period: float, camera: str | None = "front"
-) -> None:
+) -> list[np.ndarray]:
     """Write states [T, nq], `period` s apart, as PATH (webp), in the time they took; several side by side.
 
     sides: each [T, nq].  camera: see `frames`.
+    Returns its pictures, uint8 [height, width of all sides, 3] each.
     Raises NoOpenGL where nothing can draw, ValueError for states that do not fit the model or each other.
     """
     from PIL import Image
@@ -112,7 +113,7 @@ def film(
     length = len(sides[0])
     if any(len(states) != length for states in sides):
         raise ValueError(f"film: all sides must be as long as each other, got {[len(s) for s in sides]} states")
-    every = max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
+    every = _every(length, period)
     drawn = rendered_frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
     images = np.concatenate(np.array_split(np.array(drawn), len(sides)), axis=2)
     pictures = [Image.fromarray(image) for image in images]
@@ -121,6 +122,17 @@ def film(
         timing: dict[str, Any] = {"duration": shown, "loop": LOOPS}
         pictures[0].save(buffer, format="WEBP", save_all=True, append_images=pictures[1:], quality=QUALITY, **timing)
         write_bytes(path, buffer.getvalue())
+    return list(images)
+
+
+def picture_rows(time: np.ndarray) -> list[int]:
+    """Rows of states at these times [T] s, regular, of which `film` has pictures."""
+    return _rows(len(time), _every(len(time), float(time[1] - time[0]) if len(time) > 1 else 1.0), 1)
+
+
+def _every(length: int, period: float) -> int:
+    """Every how many states a film has a picture."""
+    return max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
 
 
 def _rows(length: int, every: int, sides: int) -> list[int]:
@@ -232,13 +244,16 @@ def _draw(folder: Path | None) -> None:
         return
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     view = json.loads((folder / "view.json").read_text())
-    data = mujoco.MjData(model)
-    images = []
+    data, option, images = mujoco.MjData(model), mujoco.MjvOption(), []
+    if not (model.geom_bodyid > 0).any():  # kinematics and inertias alone: boxes of the inertias and joints are drawn
+        option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = option.flags[mujoco.mjtVisFlag.mjVIS_JOINT] = True
+        model.vis.rgba.inertia, model.vis.headlight.ambient = (0.75, 0.8, 0.9, 1.0), (0.5, 0.5, 0.5)
     with mujoco.Renderer(model, *view["size"]) as renderer:
         for state in np.load(folder / "states.npy"):
             data.qpos[:] = state
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, **({"camera": view["camera"]} if view["camera"] else {}))
+            camera = {"camera": view["camera"]} if view["camera"] else {}
+            renderer.update_scene(data, scene_option=option, **camera)
             images.append(renderer.render())
     np.save(folder / "frames.npy", np.stack(images))
 

@@ -99,6 +99,41 @@ def test_numbers_are_written_into_spec_and_model(made: Made, sample: int | None,
     np.testing.assert_allclose(model.dof_invweight0, expected.dof_invweight0, rtol=1e-6)
 
 
+def test_a_batch_holds_the_draws_that_apply_writes(made: Made):
+    """Row by row, in every field; a field that no draw changes is left out, and the model stays as it was."""
+    model = mujoco.MjModel.from_xml_path(str(SCENE))
+    damping = model.dof_damping.copy()
+    fields = apply_fit.batch(model, made.fit, 5, seed=2)
+    assert {"body_mass", "dof_damping", "dof_invweight0"} <= set(fields) and "geom_size" not in fields
+    np.testing.assert_array_equal(model.dof_damping, damping)
+    for k in range(5):
+        one = mujoco.MjModel.from_xml_path(str(SCENE))
+        apply_fit.apply(one, made.fit, sample=k, seed=2)
+        for name in (n for n in dir(one) if n.startswith(("body_", "jnt_", "dof_", "geom_", "actuator_", "tendon_"))):
+            written = fields[name][k] if name in fields else getattr(model, name)
+            np.testing.assert_allclose(written, getattr(one, name), rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.ptp(fields["body_mass"], axis=0).max() > 0.1
+
+
+def test_a_batch_finds_the_robot_in_a_larger_scene(made: Made):
+    """Under a prefix; a nameless element, whose number is another there, is refused."""
+    scene, robot = mujoco.MjSpec(), mujoco.MjSpec.from_file(str(SCENE))
+    scene.option = robot.option
+    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
+    scene.attach(robot, prefix="robot/", frame=scene.worldbody.add_frame(pos=[2, 0, 0]))
+    model, alone = scene.compile(), mujoco.MjModel.from_xml_path(str(SCENE))
+    there, here = apply_fit.batch(model, made.fit, 3, prefix="robot/"), apply_fit.batch(alone, made.fit, 3)
+    joint, own = model.joint("robot/door").dofadr[0], alone.joint("door").dofadr[0]
+    np.testing.assert_array_equal(there["dof_damping"][:, joint], here["dof_damping"][:, own])
+    with pytest.raises(ValueError, match="has no body 'arm/forearm'"):
+        apply_fit.batch(model, made.fit, 1, prefix="arm/")
+    with pytest.raises(ValueError, match="count must be at least 1, got 0"):
+        apply_fit.batch(model, made.fit, 0)
+    nameless = {**made.fit, "table": [{**made.fit["table"][0], "name": ""}]}
+    with pytest.raises(ValueError, match="give it a name in the MJCF"):
+        apply_fit.batch(model, nameless, 1, prefix="robot/")
+
+
 def test_draws_are_those_of_the_gaussian(made: Made):
     """Mean and covariance of 100 draws within four sampling errors; draw 7 is draw 7 however it is asked for."""
     few = made.space.to_search(apply_fit.draws(made.fit, range(100), seed=1))

@@ -58,6 +58,15 @@ def gap_of(**values: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda fit: fit["heldout_distances"]["open_close"].update(values)
 
 
+def test_the_viewer_is_one_click_away_where_there_is_one(written: Page, tmp_path: Path, quick: None) -> None:
+    """From the page of a folder of all stages too, which lies above it."""
+    assert "identify-viewer" not in written.ids
+    make_run(tmp_path / "identify")
+    (tmp_path / "identify" / "viewer.html").write_text("moving")
+    for folder, link in ((tmp_path / "identify", "viewer.html"), (tmp_path, "identify/viewer.html")):
+        assert f'<p id="identify-viewer"><a href="{link}">' in page.write_report(folder).read_text(encoding="utf-8")
+
+
 def test_the_table_holds_the_numbers_of_the_fit(written: Page) -> None:
     for p in parameters():
         for field in ("initial_mean", "initial_std", "mean", "std"):

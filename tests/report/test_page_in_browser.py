@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import mujoco
 import numpy as np
 import pytest
 from made_up_gap import make_gap
 from made_up_run import make_run, make_whole
 
-from droid_jax.report import page
+from droid_jax.report import page, viewer
+from droid_jax.storage import write_npz
 
 BROWSER = next((b for b in ("chromium", "chromium-browser", "google-chrome") if shutil.which(b)), None)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome on the path")
@@ -171,6 +173,40 @@ def test_the_page_as_it_is_renders_without_a_complaint(report: Path) -> None:
     assert pixels.mean() > 0.8 and (pixels.min(axis=2) < 0.3).mean() > 0.005  # a light page with dark text
     colourful = np.ptp(pixels, axis=2) > 0.3
     assert colourful.mean() > 0.002  # the figures' colours
+
+
+SEEK = """<script>
+const row = data.time.length - 1, picture = document.getElementById("after");
+slider.value = row;
+slider.dispatchEvent(new Event("input"));
+const x = [...document.querySelectorAll(".cursor")].map(c => Number(c.getAttribute("x1")));
+document.documentElement.dataset.found = encodeURIComponent(JSON.stringify({
+  now: now.textContent, last: picture.src === data.pictures.after[row], cursors: x,
+  lines: document.querySelectorAll("polyline").length,
+}));
+</script></body>"""
+
+
+def test_the_viewer_moves_pictures_and_cursors_with_its_slider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    monkeypatch.setattr(
+        viewer, "rendered_frames", lambda _, states, rows, *__: [np.full((4, 6, 3), 20 * r, np.uint8) for r in rows]
+    )
+    states = np.linspace(0.0, 1.0, 9)[:, None]
+    write_npz(
+        tmp_path / "replay.npz",
+        {"time": np.arange(9) / 25.0, "before": states + 0.2, "after": states + 0.1, "measured": states,
+         "measured_joints": np.array(["a"]), "recording": np.array("pull"), "start": np.array(0.0)},
+    )  # fmt: skip
+    page_of_motion = viewer.write_viewer(tmp_path, model)
+    page_of_motion.write_text(page_of_motion.read_text().replace("</body>", SEEK), encoding="utf-8")
+    done = _browse(page_of_motion, "--dump-dom", size=(1200, 900))
+    assert not _console(done.stderr)
+    (said,) = re.findall(r'data-found="([^"]*)"', done.stdout[:10_000])
+    found = json.loads(unquote(said))
+    assert found == {"now": "0.32 s", "last": True, "cursors": [600, 600], "lines": 5}
 
 
 def test_the_console_is_really_read(report: Path) -> None:

@@ -43,6 +43,15 @@ def test_frames_show_where_the_body_is() -> None:
     assert centres[1] == pytest.approx(31.5, abs=1.5)
 
 
+@pytest.mark.gl
+def test_a_model_without_geoms_shows_its_inertias() -> None:
+    _backend()
+    body = "<body><joint type='slide'/><inertial pos='0 0 0' mass='1' diaginertia='.02 .02 .02'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (image,) = render.rendered_frames(model, np.zeros((1, 1)), [0], None, size=(48, 64))
+    assert np.ptp(image) > 60
+
+
 def test_frames_refuse_what_does_not_fit_the_model() -> None:
     import mujoco
 
