@@ -46,11 +46,11 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
 
-SECONDS = 8.0  # of a poor motion
+SECONDS = 6.0  # of a poor motion
 MOTIONS = ("shoulder alone", "elbow alone", "slow", "small", "quick and small", "both")
 FITS = IdentifyConfig(
-    search=CmaConfig(population=32, parents=None, generations=15),
-    refine=RefineConfig(basin_hops=0),
+    search=CmaConfig(population=32, parents=None, generations=8),
+    refine=RefineConfig(basin_hops=0, iterations=12),
     samples=0,
     checks=False,
 )
@@ -76,6 +76,7 @@ def with_friction() -> Scene:
     spec = two_link().spec.copy()
     for joint in spec.joints:
         joint.frictionloss = 0.02
+    spec.option.timestep = 0.004
     return compile_scene(spec, "arm", joints=JOINTS)
 
 
@@ -142,12 +143,12 @@ def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
     """One poor motion of one arm."""
     model = arm(scene, seed)
     log = recorded("poor", model, *motion(kind), seed)
+    began = time.process_time()  # what other programs take of the machine does not count
     found = excitation(scene, space, [log])
-    began = time.monotonic()
     proposal: MotionProposal = propose(scene, space, found, log)
-    seconds = found.seconds + time.monotonic() - began
+    seconds = time.process_time() - began
     fit = identifiable(scene, space, [log])
-    row: dict[str, Any] = {"motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit}
+    row: dict[str, Any] = {"motion": kind, "seed": seed, "cpu_s": seconds, "said": said(found), "fit": fit}
     if proposal.chosen:
         clock, command = proposal.commands()
         after = identifiable(scene, space, [log, recorded("added", model, clock, command, seed + 1)])
@@ -190,7 +191,7 @@ def main(command: Compared) -> dict[str, Any]:
         "open_before": len(opened),
         "told_by_addition": len(added),
         "addition_confirmed": float(np.mean(added)) if added else None,
-        "slowest_s": max(row["seconds"] for row in rows),
+        "slowest_cpu_s": max(row["cpu_s"] for row in rows),
         "motions": rows,
     }
     if panda is not None:
