@@ -156,7 +156,8 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
     head = f"{recording.name}: {recording.repeats} x {recording.duration:.4g} s"
     table = Table(title=Text(head))
     for name in ("signal", "column", "unit", "lowest", "highest", "measured", "rate, Hz", "longest step, s"):
-        table.add_column(name, overflow="fold")  # a name that is too long goes on below, none is cut
+        # A name that is too long goes on below, none is cut.
+        table.add_column(name, overflow="fold", min_width=8 if name == "signal" else None)
     for track in tracks:
         for i, column in enumerate(track.columns):
             clock = (f"{track.rate:.5g}", f"{track.longest:.3g}") if i == 0 else ("", "")

@@ -175,6 +175,8 @@ def propose(
             total = rest
     after = told(total)
     now = {t.name for t in after if t.identifiable}
+    if not now.intersection(found.open):  # narrower, but none of them enough
+        chosen, after = [], told(found.information)
     return MotionProposal(
         chosen=tuple(chosen),
         told=after,
