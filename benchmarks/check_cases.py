@@ -344,6 +344,20 @@ def _per_cent(values: np.ndarray) -> np.ndarray:
     return 100.0 * values / (1.2 * np.nanmax(np.abs(values), axis=(0, 1)))
 
 
+def _crosses(c: Case) -> bool:
+    """Whether every torque changes its sign, so that it is lost in a magnitude."""
+    if not _torque(c):
+        return False
+    values = c.recording.channels["torque"].values
+    return bool(np.all(np.mean(values > 0, axis=(0, 1)) > 0.1) and np.all(np.mean(values > 0, axis=(0, 1)) < 0.9))
+
+
+def magnitude(values: np.ndarray) -> np.ndarray:
+    """A register of 50 steps without a sign, whose first steps read 0."""
+    step = np.nanmax(np.abs(values), axis=(0, 1)) / 60.0
+    return step * np.maximum(np.round(np.abs(values) / step) - 3.0, 0.0)
+
+
 def _standing(r: Recording) -> Recording:
     """The first instant, throughout; its noise stays."""
 
@@ -479,6 +493,7 @@ ERRORS = (
     Error("milliseconds", ("clock",), ("millisecond",), _always, lambda r: _whole(r, lambda t: 1e3 * t)),
     Error("load register", ("sign", "units"), ("load register",), _torque, of("torque", _register)),
     Error("per cent", ("units",), ("per cent",), _torque, of("torque", _per_cent)),
+    Error("magnitudes", ("sign",), ("load register",), _crosses, of("torque", magnitude)),
     Error("dead torque", ("sensor",), ("dead", "does not move"), _several_torques, of("torque", _first_dead)),
     Error("rotated torques", ("order",), ("order",), _three_torques, of("torque", _turned_round)),
     Error("rotated commands", ("order",), ("order",), _three_commands, of("command", _turned_round)),

@@ -68,7 +68,7 @@ class Compared:
     quick: bool = False
     out: Path = ROOT / "benchmarks" / "results"
     seed: int = 0
-    arms: int = 2
+    arms: int = 1
 
 
 def with_friction() -> Scene:
@@ -180,7 +180,11 @@ def main(command: Compared) -> dict[str, Any]:
         for kind in kinds:
             rows.append(of_arm(scene, space, kind, 10 * seed))
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    panda = of_panda(command.real) if command.real is not None else None
+    return summary(rows, of_panda(command.real) if command.real is not None else None)
+
+
+def summary(rows: list[dict[str, Any]], panda: dict[str, Any] | None) -> dict[str, Any]:
+    """What is published of the motions, and of the Panda."""
     agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
     added = [(row["after"][n]) for row in rows if "after" in row for n in row["told_by_it"]]
     opened = [n for row in rows for n, known in row["said"].items() if not known]

@@ -37,6 +37,8 @@ class CheckCommand:
     """Measured joints of the scene; default: all driven ones."""
     object_joint: str | None = None
     """Joint of the object that is moved."""
+    motion_cutoff: float | None = None
+    """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     out: Path = Path("runs/check")
     """Folder of check.html and check.json, and of addition.csv where a motion is proposed."""
 
@@ -44,7 +46,7 @@ class CheckCommand:
 def run(command: CheckCommand) -> None:
     """Print the tables, and write page and JSON."""
     from droid_jax import runtime
-    from droid_jax.commands.options import recording_at
+    from droid_jax.commands.options import compared, needs_log, recording_at
 
     if command.parameters is not None and command.scene is not None:
         runtime.start()  # before what is imported below starts jax
@@ -59,6 +61,8 @@ def run(command: CheckCommand) -> None:
         raise ValueError("--joints, --object-joint and --parameters are of a scene: give --scene too")
     refuse_special(command.out, "a folder")
     recordings = [recording_at(path) for path in command.recording]
+    needs_log(command.motion_cutoff, recordings)
+    cutoff = compared(command.motion_cutoff).motion_cutoff
     checked = []
     for recording in recordings:
         scene = None
@@ -66,7 +70,7 @@ def run(command: CheckCommand) -> None:
             # A log without commands may have been measured on a robot that the scene drives with nothing.
             joints = command.joints or (() if recording.command.size else _measured(recording))
             scene = load_scene(command.scene, joints=joints or None, object_joint=command.object_joint, hold=True)
-        checked.append((recording, contents(recording), inspect_log(recording, scene)))
+        checked.append((recording, contents(recording), inspect_log(recording, scene, cutoff)))
     for recording, tracks, findings in checked:
         _show(recording, tracks, findings)
     told, why = None, ""
@@ -94,8 +98,9 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
     """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
     if command.parameters is None or command.scene is None:
         return None
+    from droid_jax.commands.options import compared
     from droid_jax.identify.additions import propose
-    from droid_jax.identify.excitation import excitation
+    from droid_jax.identify.excitation import ExcitationConfig, excitation
     from droid_jax.model.parameter_file import friction_joints, load_parameters
     from droid_jax.model.scene import load_scene
 
@@ -105,7 +110,8 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
         command.scene, joints=joints or None, object_joint=command.object_joint, friction_joints=rows, hold=True
     )
     space = load_parameters(command.parameters, scene)
-    found = excitation(scene, space, recordings)
+    config = ExcitationConfig(compare=compared(command.motion_cutoff))
+    found = excitation(scene, space, recordings, config)
     return found, propose(scene, space, found, recordings[0])
 
 
@@ -150,7 +156,8 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
     head = f"{recording.name}: {recording.repeats} x {recording.duration:.4g} s"
     table = Table(title=Text(head))
     for name in ("signal", "column", "unit", "lowest", "highest", "measured", "rate, Hz", "longest step, s"):
-        table.add_column(name, overflow="fold")  # a name that is too long goes on below, none is cut
+        # A name that is too long goes on below, none is cut.
+        table.add_column(name, overflow="fold", min_width=8 if name == "signal" else None)
     for track in tracks:
         for i, column in enumerate(track.columns):
             clock = (f"{track.rate:.5g}", f"{track.longest:.3g}") if i == 0 else ("", "")

@@ -134,7 +134,8 @@ def run(command: Convert) -> None:
         recording = recording.window(first if start is None else start, last if end is None else end)
     path = save_recording(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
-    print(f"{recording.repeats} repeats of {recording.duration:.1f} s, channels {channels}: {path}")
+    repeats = "1 repeat" if recording.repeats == 1 else f"{recording.repeats} repeats"
+    print(f"{repeats} of {recording.duration:.1f} s, channels {channels}: {path}")
     if keep is not None:
         keep()
 

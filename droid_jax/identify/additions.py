@@ -53,6 +53,7 @@ class MotionProposal:
 
     chosen: in the order in which they were picked.  told: of each parameter with them.  opened: the names that they
     make identifiable.  left: those that stay open.  joints, start: [U] of the commands, and where they begin, rad or m.
+    tried: candidates.
     """
 
     chosen: tuple[Addition, ...]
@@ -61,6 +62,7 @@ class MotionProposal:
     left: tuple[str, ...]
     joints: tuple[str, ...]
     start: np.ndarray
+    tried: int
 
     @property
     def seconds(self) -> float:
@@ -72,6 +74,8 @@ class MotionProposal:
         """What to record, or why nothing would help."""
         if not self.opened and not self.left:
             return "These recordings tell all parameters."
+        if not self.tried:
+            return f"Open stay {', '.join(self.left)}. No motion is proposed where a hand holds an object."
         left = f"None of the motions that were tried tells {', '.join(self.left)}" if self.left else ""
         left += ": another load, more repeats or a narrower prior may." if left else ""
         if not self.opened:
@@ -171,6 +175,8 @@ def propose(
             total = rest
     after = told(total)
     now = {t.name for t in after if t.identifiable}
+    if not now.intersection(found.open):  # narrower, but none of them enough
+        chosen, after = [], told(found.information)
     return MotionProposal(
         chosen=tuple(chosen),
         told=after,
@@ -178,6 +184,7 @@ def propose(
         left=tuple(name for name in found.open if name not in now),
         joints=joints,
         start=start,
+        tried=len(candidates),
     )
 
 

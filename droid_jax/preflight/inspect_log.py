@@ -15,17 +15,19 @@ from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.inverse_dynamics import prescribed
+from droid_jax.simulate.measured_motion import CUTOFF, measured_motion
 from droid_jax.simulate.replay import make_drive
 
 ORDER = ("certain", "likely", "note")
 
 
-def inspect_log(recording: Recording, scene: Scene | None = None) -> tuple[Finding, ...]:
+def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff: float = CUTOFF) -> tuple[Finding, ...]:
     """What of a recording can hardly be right, and what has to be known of it, the gravest first.
 
     Args:
         recording: a valid one.
         scene: that it is meant for; without one only what is in the recording itself is judged.
+        motion_cutoff: Hz, of the filter of a log's positions (`CompareConfig.motion_cutoff`).
 
     Returns:
         The findings. Nothing is refused: what a replay would refuse is a finding that is certain.
@@ -36,17 +38,17 @@ def inspect_log(recording: Recording, scene: Scene | None = None) -> tuple[Findi
     found += _said("range", lambda: check_range(scene, recording))
     found += check_log(scene, recording)
     if not found or found[0].kind != "range":
-        found += _said("scene", lambda: _replayable(scene, recording))
+        found += _said("scene", lambda: _replayable(scene, recording, motion_cutoff))
     if recording.command.size:
         found += _said("start", lambda: warn_if_moving(recording))
         found += [Finding("scene", "", 0.0, 0.0, "note", text) for text in _notes(scene, recording)]
     return _sorted(found)
 
 
-def _replayable(scene: Scene, recording: Recording) -> None:
+def _replayable(scene: Scene, recording: Recording, motion_cutoff: float) -> None:
     """Raise ValueError where no replay can follow the recording; that it lacks commands `_notes` says."""
     if not recording.command.size:
-        prescribed(scene, recording)
+        measured_motion(recording, prescribed(scene, recording), cutoff=motion_cutoff)
     elif set(scene.needs_command) <= set(recording.command_names):
         make_drive(scene, recording, weigh="torque" in recording.channels)
 

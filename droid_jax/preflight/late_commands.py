@@ -1,4 +1,4 @@
-"""Commands that take effect late, and torques that stay at a limit: no faults, but a fit has to know of them."""
+"""Commands that take effect late, torques that stay at a limit, and torques that have no sign."""
 
 from __future__ import annotations
 
@@ -47,14 +47,17 @@ def check_delay(scene: Scene, recording: Recording, motion: LogMotion) -> list[F
 
 
 def check_saturation(recording: Recording) -> list[Finding]:
-    """Torques that stay at their largest value, as those of a driver at its limit do."""
+    """Torques that stay at their largest value, as those of a driver at its limit do, or at 0, as magnitudes do."""
     channel = recording.channels.get("torque")
     if channel is None:
         return []
-    found = []
+    found, unsigned = [], []
     for c, joint in enumerate(channel.columns):
         if (said := _limit(channel, c)) is not None:
             limit, share = said
+            if limit == 0.0:
+                unsigned.append(joint)
+                continue
             found.append(
                 Finding(
                     "saturation", joint, limit, 0.0, "note",
@@ -63,6 +66,15 @@ def check_saturation(recording: Recording) -> list[Finding]:
                     "forcerange in the MJCF",
                 )
             )  # fmt: skip
+    if unsigned:
+        found.append(
+            Finding(
+                "sign", unsigned[0], 0.0, 0.0, "likely",
+                f"recording {recording.name!r}: the torque of {', '.join(unsigned)} never changes its sign and rests "
+                "at 0: is this a load register, the share that the drive puts out, and no torque? Leave that column "
+                "out then, and fit the positions",
+            )
+        )  # fmt: skip
     return found
 
 

@@ -11,6 +11,7 @@ from scipy import interpolate, signal
 from droid_jax.recordings.recording import Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
+BRIDGED = 0.25  # periods of the cutoff: over gaps no longer than that positions are interpolated
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
 REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
@@ -60,7 +61,8 @@ def measured_motion(
 ) -> Motion:
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
-    A repeat that was not measured for a while keeps its distance from the others there (see `_common`).
+    A repeat that was not measured for a while keeps its distance from the others there (see `_common`); gaps of BRIDGED
+    periods of the cutoff are bridged.
     The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz; velocity and acceleration are those
     of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
@@ -77,7 +79,7 @@ def measured_motion(
             "a motion is prescribed for every measured joint (--joints)"
         )
     columns = [channel.columns.index(j) for j in joints]
-    mask = channel.mask[:, :, columns]
+    values, mask = _bridged(channel.time, channel.values[:, :, columns], channel.mask[:, :, columns], BRIDGED / cutoff)
     if not mask.any(axis=0).all():
         row, column = np.argwhere(~mask.any(axis=0))[0]
         raise ValueError(
@@ -90,9 +92,9 @@ def measured_motion(
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
-    position = _common(channel.values[:, :, columns], mask)
+    position = _common(values, mask)
     judged = [i for i, joint in enumerate(joints) if alike is None or joint in alike]
-    measured = np.ma.masked_array(channel.values[:, :, columns], ~mask)[:, :, judged]
+    measured = np.ma.masked_array(values, ~mask)[:, :, judged]
     _check_alike(recording.name, [joints[i] for i in judged], measured, position[:, judged])
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
@@ -114,6 +116,22 @@ def measured_motion(
         torque_slack=config.tolerance * noise,
         acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
     )
+
+
+def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [N, T, J] and their mask, with cubic splines over gaps of `longest` s at most."""
+    values, mask = values.copy(), mask.copy()
+    for n, j in np.argwhere(~mask.all(axis=1)):
+        seen = np.flatnonzero(mask[n, :, j])
+        for gap in np.flatnonzero(np.diff(seen) > 1):
+            first, last = int(seen[gap]), int(seen[gap + 1])
+            if time[last] - time[first] <= longest:
+                between = slice(first + 1, last)
+                near = seen[max(0, gap - 3) : gap + 5]
+                path = interpolate.make_interp_spline(time[near], values[n, near, j], k=min(3, len(near) - 1))
+                values[n, between, j] = path(time[between])
+                mask[n, between, j] = True
+    return values, mask
 
 
 def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from two_link import arm
 
-from benchmarks.check_cases import JOINTS, RATE, measured, played
+from benchmarks.check_cases import JOINTS, RATE, magnitude, measured, played
 from droid_jax.cost.cost import make_cost
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
@@ -306,6 +306,13 @@ def test_a_torque_at_its_limit_is_said():
     (finding,) = [f for f in check_log(scene(), cut) if f.kind == "saturation"]
     assert (finding.column, finding.value) == ("elbow", limit) and "stays at" in finding.sentence
     assert [f for f in check_log(scene(), recording()) if f.kind == "saturation"] == []
+
+
+def test_torques_without_their_sign_are_a_load_register():
+    unsigned = of_channel("torque", magnitude)(recording(True, size=5 * SIZE))
+    (finding,) = check_alone(unsigned)
+    assert (finding.kind, finding.severity) == ("sign", "likely") and "load register" in finding.sentence
+    assert finding.sentence.count("shoulder, elbow") == 1
 
 
 def test_a_dead_column_of_a_log_without_commands():

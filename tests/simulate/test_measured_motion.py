@@ -88,11 +88,21 @@ def test_a_gap_that_no_filter_bridges_is_refused():
         measured_motion(log(sines(TIME[kept])[None], TIME[kept]), JOINTS)
 
 
+def test_a_short_gap_is_bridged():
+    """What was recorded there is not looked at, and the filter sees nothing of the spline in its place."""
+    values, mask = sines(TIME)[None].copy(), np.ones((1, len(TIME), 2), bool)
+    mask[0, 1234:1243, 1] = False
+    values[~mask] = np.nan
+    motion = measured_motion(log(values, mask=mask), JOINTS)
+    np.testing.assert_allclose(motion.position, sines(motion.time), atol=1e-3)
+    np.testing.assert_allclose(motion.acceleration, sines(motion.time, 2), atol=0.3)
+
+
 def test_what_cannot_be_a_motion_is_refused():
     with pytest.raises(ValueError, match="lack wrist"):
         measured_motion(log(sines(TIME)[None]), ("a", "wrist"))
     mask = np.ones((1, len(TIME), 2), bool)
-    mask[0, 1234, 1] = False
+    mask[0, 1234:1250, 1] = False  # of a longer time than a quarter of the cutoff's period
     with pytest.raises(ValueError, match=r"column .b.: not measured at 1\.234 s"):
         measured_motion(log(sines(TIME)[None], mask=mask), JOINTS)
     slow = TIME[::40]
