@@ -73,6 +73,7 @@ class LinearPart:
     raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat.  base: [M, D] what a search unit of
     each base parameter adds.  rows: what is resampled.  channel: [M] name of the channel of each residual.
     level: mean square of the residual where nothing is missing, of rows that are blocks.
+    step: [M] what a finer time step changes; None: not measured.
     """
 
     raw: np.ndarray
@@ -80,6 +81,7 @@ class LinearPart:
     rows: Resampling
     channel: np.ndarray
     level: float = 0.0
+    step: np.ndarray | None = None
 
     def of(self, channels: Sequence[str]) -> LinearPart:
         """The same of some channels."""
@@ -87,7 +89,8 @@ class LinearPart:
         rows = (
             Repeats(self.rows.deviations[:, kept]) if isinstance(self.rows, Repeats) else Blocks(self.rows.block[kept])  # type: ignore[attr-defined]
         )
-        return replace(self, raw=self.raw[:, kept], base=self.base[kept], rows=rows, channel=self.channel[kept])
+        step = None if self.step is None else self.step[kept]
+        return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,7 @@ class LinearModel:
     directions: K coefficients.  train, validation: parts.  prior: [D] deviations of the base parameters' priors in a
     fit, search units.  slack: times these that the score test lets parameters move.  repeats: N that are rehearsed; of
     blocks how many times the recording's own length, times its blocks.
-    step_error: U0.  minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
+    minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -106,7 +109,6 @@ class LinearModel:
     prior: np.ndarray
     slack: float
     repeats: int
-    step_error: float
     minimum: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -129,6 +131,14 @@ class LinearModel:
     def of(self, channels: Sequence[str]) -> LinearModel:
         """The same with some channels compared."""
         return replace(self, train=self.train.of(channels), validation=self.validation.of(channels))
+
+    @property
+    def step_error(self) -> float:
+        """U0: what the base parameters cannot absorb of a finer time step's difference."""
+        if self.train.step is None:
+            return 0.0
+        left = project(self.train.step[None], self.train.base, self.held(1.0))[0]
+        return float(left @ left / self.train.rows.counted.sum())
 
     def projected(self) -> np.ndarray:
         """[K, M] sensitivities of the training part, as the score test has them."""

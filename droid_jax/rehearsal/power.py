@@ -86,13 +86,13 @@ def discrepancy_crossings(
     """
     if not model.repeated:
         return np.zeros(config.draws)
-    rng, count = np.random.default_rng([config.seed, 3, k]), model.repeats
+    rng, count, step_error = np.random.default_rng([config.seed, 3, k]), model.repeats, model.step_error
     sizes = (strength, float(np.linalg.norm(gains.added[k])) * count**0.5)
     out = np.zeros(config.draws)
     for part, factor, unit in zip((model.train, model.validation), (WORST, 1.0), sizes, strict=True):
         residuals = float(part.rows.counted.sum())
         along, beside = rng.normal(size=(2, config.draws))
-        least = count * residuals * factor * model.step_error - np.sqrt(2 * residuals) * beside
+        least = count * residuals * factor * step_error - np.sqrt(2 * residuals) * beside
         needed = np.sqrt(np.maximum(along**2 + least, 0.0)) - along
         out = np.maximum(out, np.maximum(needed, 0.0) / max(unit, 1e-30))
     return out

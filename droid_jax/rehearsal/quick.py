@@ -6,6 +6,7 @@ Parameters stand where they are known; each candidate effect is simulated once w
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from droid_jax.cost.channels import SIMULATED
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, discretisation_error, refit
+from droid_jax.discrepancy.fitting import FittedModel, refit, step_difference
 from droid_jax.discrepancy.log_case import base_model
 from droid_jax.discrepancy.residual_set import ResidualSet
 from droid_jax.discrepancy.windowed_case import case_of
@@ -137,15 +138,12 @@ def rehearsed(
     else:
         beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
         validation = part_of(case.validation, beside_base, directions, base.refined.free)
-    error = 0.0
     if step_error and split is not Split.BLOCKS:
         clock("step error")
-        try:
-            error = discretisation_error(case.train, base, roles["train"])
-        except NotReplayed:
-            error = 0.0
+        with contextlib.suppress(NotReplayed):
+            train = replace(train, step=step_difference(case.train, base, roles["train"]))
     clock("")
-    model = linear_model(case, base, directions, train, validation, error)
+    model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
 
 
@@ -187,7 +185,6 @@ def linear_model(
     directions: Sequence[ScoreDirection],
     train: LinearPart,
     validation: LinearPart,
-    step_error: float,
 ) -> LinearModel:
     """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
     space, minimum = case.full_space, case.minimum_sizes
@@ -199,7 +196,6 @@ def linear_model(
         prior=base.refined.prior[base.refined.free],
         slack=case.train.prior_slack,
         repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
-        step_error=step_error,
         minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
         low=np.array([p.low - p.mean for p in of]),
         high=np.array([p.high - p.mean for p in of]),
@@ -228,7 +224,8 @@ def told_parameters(found: Rehearsed, model: LinearModel, more: float = 1.0) -> 
 
 def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaussian:
     rows = model.train.rows
-    deviations = [rows.deviations] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
+    # Of the mean of the repeats, as the slopes are.
+    deviations = [rows.deviations * rows.units**0.5] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
     return calibrated(refined, deviations, None, train.identifiability.pooling)
 
 
@@ -386,7 +383,7 @@ def quick_rehearsal(
                 for row in found.noise
                 if row[0] in found.compared
             ],
-            "step_error": found.model.step_error,
+            "step_error": model.step_error,
             "level": model.train.level,
             "directions": len(model.directions),
             "rehearsal": asdict(rehearsal),

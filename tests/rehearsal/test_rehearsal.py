@@ -72,7 +72,7 @@ def linear(rows: Resampling, level: float = 0.0, repeats: int = 1, **changes) ->
     part = LinearPart(raw, base, rows, channel, level)
     usual = dict(
         directions=directions(DIRECTIONS), train=part, validation=part, prior=WIDE, slack=3.0, repeats=repeats,
-        step_error=0.0, minimum=np.zeros(DIRECTIONS), low=np.full(DIRECTIONS, -np.inf),
+        minimum=np.zeros(DIRECTIONS), low=np.full(DIRECTIONS, -np.inf),
         high=np.full(DIRECTIONS, np.inf),
     )  # fmt: skip
     return LinearModel(**{**usual, **changes})
@@ -144,7 +144,8 @@ def test_bounds_and_minimum_sizes_decide_where_noise_does_not():
     (bound,) = smallest_sizes(of_repeats(high=np.full(DIRECTIONS, 0.5 * plain.size)), [1], CONFIG)
     assert least.size > 100.0 and least.limit == "minimum effect size"
     assert np.isinf(bound.size) and bound.limit == "beyond its bounds"
-    (step,) = smallest_sizes(of_repeats(step_error=50.0), [1], CONFIG)
+    part = replace(of_repeats().train, step=np.random.default_rng(0).normal(0, 7.0, LENGTH))
+    (step,) = smallest_sizes(of_repeats(train=part), [1], CONFIG)
     assert step.limit == "time step" and step.size > plain.size
 
 
