@@ -73,6 +73,8 @@ class LinearPart:
     raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat.  base: [M, D] what a search unit of
     each base parameter adds.  rows: what is resampled.  channel: [M] name of the channel of each residual.
     level: mean square of the residual where nothing is missing, of rows that are blocks.
+    residual: [M] of the base model, whose colour the noise of blocks has; None: white noise of deviation one.
+    column: [M] number of the compared column of each residual.
     step: [M] what a finer time step changes; None: not measured.
     """
 
@@ -82,6 +84,8 @@ class LinearPart:
     channel: np.ndarray
     level: float = 0.0
     step: np.ndarray | None = None
+    residual: np.ndarray | None = None
+    column: np.ndarray | None = None
 
     def of(self, channels: Sequence[str]) -> LinearPart:
         """The same of some channels."""
@@ -89,8 +93,26 @@ class LinearPart:
         rows = (
             Repeats(self.rows.deviations[:, kept]) if isinstance(self.rows, Repeats) else Blocks(self.rows.block[kept])  # type: ignore[attr-defined]
         )
-        step = None if self.step is None else self.step[kept]
-        return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, step)
+        each = (None if a is None else a[kept] for a in (self.step, self.residual, self.column))
+        return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, *each)
+
+    def noise(self, draws: int, rng: np.random.Generator) -> np.ndarray:
+        """[R, M] drawn noise of one log: the base residual with other phases, column by column, where it counts.
+
+        So it is as large and as slow as what the base model leaves.  Source of the phases: Theiler et al., Testing for
+        nonlinearity in time series, Physica D 1992.
+        """
+        counted = self.rows.counted
+        if self.residual is None or self.column is None:
+            return rng.normal(size=(draws, len(counted))) * counted
+        out = np.zeros((draws, len(counted)))
+        for column in np.unique(self.column):
+            at = np.flatnonzero((self.column == column) & counted)
+            spectrum = np.abs(np.fft.rfft(self.residual[at]))
+            turned = spectrum * np.exp(2j * np.pi * rng.random((draws, len(spectrum))))
+            turned[:, 0] = spectrum[0] * rng.choice([-1.0, 1.0], draws)
+            out[:, at] = np.fft.irfft(turned, len(at), axis=1)
+        return out
 
 
 @dataclass(frozen=True, eq=False)

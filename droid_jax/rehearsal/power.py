@@ -17,8 +17,8 @@ from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
 from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, unhindered
 
-LEAST, MOST = 1.5, 80.0  # noncentralities between which the smallest size is looked for
-HALVINGS = 8
+LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for
+HALVINGS = 10
 CHUNK = 4e6  # numbers of a batch of flips
 
 
@@ -217,7 +217,7 @@ def _of_blocks(
     flips = sign_flips(count, config.seed)[: config.flips]
     left = rows.left_after_flips(unit, model.train.base, held, flips)  # [F, K]
     inside = [np.flatnonzero(rows.block == b) for b in range(count)]
-    drawn = rng.normal(size=(config.draws, unit.shape[1])) * rows.counted
+    drawn = model.train.noise(config.draws, rng)
 
     def of_rows(vectors: np.ndarray, other: np.ndarray) -> np.ndarray:
         """[A, B, N] products of rows of two sets of vectors, block by block, as `Blocks.residuals` scales them."""
@@ -282,7 +282,8 @@ class GainDraws:
         level = self.model.validation.level * rows.counted.sum()
         share = selection.least_gain
         least = np.sqrt(share / (1 - share) * level / total)
-        noise = rng.normal(size=(self.config.draws, count)) * np.sqrt(squares)
+        drawn = self.model.validation.noise(self.config.draws, rng) * added
+        noise = np.stack([drawn[:, rows.block == b].sum(axis=1) for b in range(count)], axis=1)
         flips = sign_flips(count, self.config.seed, one_sided=True)
         flips = np.r_[flips[:1], rng.permutation(flips[1:])[: self.config.flips]]
 

@@ -175,8 +175,11 @@ def part_of(
     names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
     channel = np.array(names)[residual_set.column]
     raw = sensitivities(residual_set, base.values, directions)
-    level = 0.0 if residual_set.resampling.repeated else base.discrepancy
-    return LinearPart(raw, base.refined.jacobian[:, free] / root, residual_set.resampling, channel, level)
+    rows, slopes = residual_set.resampling, base.refined.jacobian[:, free] / root
+    if rows.repeated:
+        return LinearPart(raw, slopes, rows, channel)
+    left = base.residuals.mean(axis=0)
+    return LinearPart(raw, slopes, rows, channel, base.discrepancy, residual=left, column=residual_set.column)
 
 
 def linear_model(
