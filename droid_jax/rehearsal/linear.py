@@ -43,9 +43,9 @@ class RehearsalConfig:
     """
 
     share: float = 0.9
-    draws: int = 48
-    flips: int = 512
-    close: float = 0.97
+    draws: int = 40
+    flips: int = 400
+    close: float = 0.95
     recovered: float | None = None
     pooling: float = 12.0
     noise: dict[str, float] = field(default_factory=_assumed)

@@ -18,7 +18,7 @@ from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_fl
 from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, unhindered
 
 LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for
-HALVINGS = 10
+HALVINGS = 8
 CHUNK = 4e6  # numbers of a batch of flips
 
 
@@ -182,12 +182,12 @@ def _of_repeats(
     kept = value > 1e-9 * max(value.max(initial=0.0), 1e-30)
     root = deviation[:, None] * vector[:, kept] * np.sqrt(value[kept])  # [K, r]
     drawn = rng.normal(size=(config.draws, int(kept.sum()), count))
-    flips = sign_flips(count, config.seed)[: config.flips]
+    flips = sign_flips(count, config.seed)[: config.flips].astype(np.float32)
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
 
     def p_values(scores: np.ndarray, of: np.ndarray) -> np.ndarray:
         """[R] as `statistics.largest_detrended_t` has them, of scores [R, S, N]."""
-        straight = np.moveaxis(detrended(np.moveaxis(scores, 2, 0)), 0, 2)
+        straight = np.moveaxis(detrended(np.moveaxis(scores, 2, 0)), 0, 2).astype(np.float32)
         out = []
         for part in np.array_split(straight, max(1, int(straight.size * len(flips) / count / CHUNK))):
             t = np.abs(t_values(part.reshape(-1, count), flips)).reshape(len(flips), len(part), -1).max(axis=2)

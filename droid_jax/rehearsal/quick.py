@@ -270,14 +270,16 @@ def improvements(
     faster: Rehearsed | None = None,
 ) -> list[dict[str, Any]]:
     """What more repeats, another channel or another motion would change, the most helpful first."""
-    model = found.model.of(found.compared)
-    wanted = hidden_directions(model)
+    model, every = found.model.of(found.compared), hidden_directions(found.model)
+    known, wanted = zip(*_one_each(known, every), strict=True)
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
     out = []
     for what, other, more, source in _variants(found, faster):
         if source is found and not other.repeated and more > 1:
-            after, told = before / np.sqrt(more), _recovered(found, other, rehearsal, more)
+            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
+            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
+            told = _recovered(found, other, rehearsal, more)
         else:
             sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
             after, told = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
@@ -293,6 +295,16 @@ def improvements(
             }
         )
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
+
+
+def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list[tuple[Mapping[str, Any], int]]:
+    """Of each effect the place and coefficient that is found at the smallest share of its bound."""
+    best: dict[str, tuple[Mapping[str, Any], int]] = {}
+    for entry, k in zip(known, wanted, strict=True):
+        other = best.get(entry["effect"])
+        if other is None or entry["smallest"] / entry["bound"] < other[0]["smallest"] / other[0]["bound"]:
+            best[entry["effect"]] = entry, k
+    return list(best.values())
 
 
 def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
