@@ -53,8 +53,8 @@ Tell = Callable[[str], None]
 class Rehearsed:
     """A linear model with what it came from.
 
-    model: of all channels that are known or assumed.  compared: those that the search compares.  refined: slopes of
-    the base parameters.  deviations: of the repeats.  noise: (channel, column, unit, deviation, source) of one sample.
+    split, case, roles: of the search.  base: the base parameters where they are known, with their slopes.
+    model: of all channels that are known or assumed.  compared: those that the search compares.  noise: of each column.
     """
 
     split: Split
@@ -101,25 +101,12 @@ def rehearsed(
     start = space.values(dict(plan.values or {}))
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
-    commanded = all(r.command.size for r in recordings)
     config = replace(config, channels=plan.channels or config.channels)
-    noise = list[ColumnNoise]()
-    made = list[Recording]()
-    if not commanded and plan.simulated:
-        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
-    as_measured = not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS)
-    for i, recording in enumerate(recordings):
-        if as_measured:
-            full, each = recording, noise_of_log(recording)
-        else:
-            rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
-            full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
-        made.append(full)
-        noise = noise or each
+    made, noise = _made(scene, whole, effects, recordings, at, plan, config, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
     split = split_of(made)
     roles = roles_of(split, made)
-    every = _alike(made) if commanded and split is not Split.WINDOWS else chosen
+    every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
     clock("case")
     needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
     case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
@@ -145,6 +132,35 @@ def rehearsed(
     clock("")
     model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
+
+
+def _made(
+    scene: Scene,
+    whole: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    at: np.ndarray,
+    plan: RehearsalPlan,
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+) -> tuple[list[Recording], list[ColumnNoise]]:
+    """The recordings to rehearse, and the noise of the first one's columns; at: [D] where parameters stand.
+
+    Logs that are cut in time stay as they are: their noise is what fits leave of them.
+    """
+    commanded = all(r.command.size for r in recordings)
+    if not commanded and plan.simulated:
+        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
+    if not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS):
+        return list(recordings), noise_of_log(recordings[0])
+    made = list[Recording]()
+    noise = list[ColumnNoise]()
+    for i, recording in enumerate(recordings):
+        rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
+        full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        made.append(full)
+        noise = noise or each
+    return made, noise
 
 
 def _compared(
