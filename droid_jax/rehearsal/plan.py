@@ -155,7 +155,7 @@ def planned_recording(
     mix = rng.normal(size=(repeats, recording.repeats))
     channels, noise = dict[str, Channel](), list[ColumnNoise]()
     for name in possible_channels(scene, recording):
-        known = of_scene(scene, recording.channels.get(name))
+        known = columns_of_scene(scene, recording.channels.get(name))
         stated = (plan.noise or {}).get(name) if plan.simulated or known is None else None
         columns = simulated_columns(scene, name) if known is None else known.columns
         deviation, source, apart = column_noise(known, len(columns), stated, config.noise[name])
@@ -180,7 +180,7 @@ def simulated_columns(scene: Scene, name: str) -> tuple[str, ...]:
     return (str(scene.object_joint),) if name == "object_angle" else scene.joints
 
 
-def of_scene(scene: Scene, channel: Channel | None) -> Channel | None:
+def columns_of_scene(scene: Scene, channel: Channel | None) -> Channel | None:
     """A measured channel's columns that the scene measures too; None where there is none."""
     if channel is None or channel.name == "object_angle":
         return channel
