@@ -11,6 +11,7 @@ import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.cost import followed
+from droid_jax.cost.errors import of_scene
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
@@ -155,7 +156,9 @@ def planned_recording(
     mix = rng.normal(size=(repeats, recording.repeats))
     channels, noise = dict[str, Channel](), list[ColumnNoise]()
     for name in possible_channels(scene, recording):
-        known = columns_of_scene(scene, recording.channels.get(name))
+        measured = recording.channels.get(name)
+        seen = None if measured is None else of_scene(scene, measured)
+        known = seen if seen is not None and seen.columns else None
         stated = (plan.noise or {}).get(name) if plan.simulated or known is None else None
         columns = simulated_columns(scene, name) if known is None else known.columns
         deviation, source, apart = column_noise(known, len(columns), stated, config.noise[name])
@@ -178,17 +181,6 @@ def planned_recording(
 def simulated_columns(scene: Scene, name: str) -> tuple[str, ...]:
     """Of a channel that nobody measured."""
     return (str(scene.object_joint),) if name == "object_angle" else scene.joints
-
-
-def columns_of_scene(scene: Scene, channel: Channel | None) -> Channel | None:
-    """A measured channel's columns that the scene measures too; None where there is none."""
-    if channel is None or channel.name == "object_angle":
-        return channel
-    kept = [i for i, c in enumerate(channel.columns) if c in scene.joints]
-    if not kept:
-        return None
-    columns = tuple(channel.columns[i] for i in kept)
-    return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
 
 
 def noise_of_log(recording: Recording) -> list[ColumnNoise]:
