@@ -336,18 +336,31 @@ def discretisation_error(
     Raises:
         NotReplayed: the finer replay blows up.
     """
+    off = step_difference(residual_set, model, recording, fine)
+    if off is None:
+        return 0.0
+    count = residual_set.repeats
+    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
+    return float(left @ left / residual_set.resampling.counted.sum())
+
+
+def step_difference(
+    residual_set: ResidualSet, model: FittedModel, recording: Recording, fine: Cost | None = None
+) -> np.ndarray | None:
+    """[M] what a quarter of the time step changes, in one repeat's noise; None in inverse mode.
+
+    Arguments and errors as of `discretisation_error`.
+    """
     cost = residual_set.cost
     fine = with_finer_step(residual_set, model.space, recording) if fine is None else fine.against([recording])
     if fine is None:
-        return 0.0
+        return None
     values = model.values[cost.space.columns(model.space)]
-    count = residual_set.repeats
     coarse = residual_set.whitened(model.values[None])[0]
-    off = (fine.whitened(values[None])[0] - coarse).astype(np.float64) / np.sqrt(count)
+    off = (fine.whitened(values[None])[0] - coarse).astype(np.float64) / np.sqrt(residual_set.repeats)
     if not np.isfinite(off).all():
         raise NotReplayed(f"the simulation of {recording.name!r} blows up at a quarter of its time step")
-    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
-    return float(left @ left / residual_set.resampling.counted.sum())
+    return off
 
 
 def beyond_step_error(discrepancy: float, discretisation_error: float) -> bool:

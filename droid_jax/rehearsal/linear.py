@@ -43,9 +43,9 @@ class RehearsalConfig:
     """
 
     share: float = 0.9
-    draws: int = 48
-    flips: int = 512
-    close: float = 0.97
+    draws: int = 40
+    flips: int = 400
+    close: float = 0.95
     recovered: float | None = None
     pooling: float = 12.0
     noise: dict[str, float] = field(default_factory=_assumed)
@@ -73,6 +73,9 @@ class LinearPart:
     raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat.  base: [M, D] what a search unit of
     each base parameter adds.  rows: what is resampled.  channel: [M] name of the channel of each residual.
     level: mean square of the residual where nothing is missing, of rows that are blocks.
+    residual: [M] of the base model, whose colour the noise of blocks has; None: white noise of deviation one.
+    column: [M] number of the compared column of each residual.
+    step: [M] what a finer time step changes; None: not measured.
     """
 
     raw: np.ndarray
@@ -80,6 +83,9 @@ class LinearPart:
     rows: Resampling
     channel: np.ndarray
     level: float = 0.0
+    step: np.ndarray | None = None
+    residual: np.ndarray | None = None
+    column: np.ndarray | None = None
 
     def of(self, channels: Sequence[str]) -> LinearPart:
         """The same of some channels."""
@@ -87,7 +93,26 @@ class LinearPart:
         rows = (
             Repeats(self.rows.deviations[:, kept]) if isinstance(self.rows, Repeats) else Blocks(self.rows.block[kept])  # type: ignore[attr-defined]
         )
-        return replace(self, raw=self.raw[:, kept], base=self.base[kept], rows=rows, channel=self.channel[kept])
+        each = (None if a is None else a[kept] for a in (self.step, self.residual, self.column))
+        return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, *each)
+
+    def noise(self, draws: int, rng: np.random.Generator) -> np.ndarray:
+        """[R, M] drawn noise of one log: the base residual with other phases, column by column, where it counts.
+
+        So it is as large and as slow as what the base model leaves.  Source of the phases: Theiler et al., Testing for
+        nonlinearity in time series, Physica D 1992.
+        """
+        counted = self.rows.counted
+        if self.residual is None or self.column is None:
+            return rng.normal(size=(draws, len(counted))) * counted
+        out = np.zeros((draws, len(counted)))
+        for column in np.unique(self.column):
+            at = np.flatnonzero((self.column == column) & counted)
+            spectrum = np.abs(np.fft.rfft(self.residual[at]))
+            turned = spectrum * np.exp(2j * np.pi * rng.random((draws, len(spectrum))))
+            turned[:, 0] = spectrum[0] * rng.choice([-1.0, 1.0], draws)
+            out[:, at] = np.fft.irfft(turned, len(at), axis=1)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +122,7 @@ class LinearModel:
     directions: K coefficients.  train, validation: parts.  prior: [D] deviations of the base parameters' priors in a
     fit, search units.  slack: times these that the score test lets parameters move.  repeats: N that are rehearsed; of
     blocks how many times the recording's own length, times its blocks.
-    step_error: U0.  minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
+    minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -106,7 +131,6 @@ class LinearModel:
     prior: np.ndarray
     slack: float
     repeats: int
-    step_error: float
     minimum: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -129,6 +153,14 @@ class LinearModel:
     def of(self, channels: Sequence[str]) -> LinearModel:
         """The same with some channels compared."""
         return replace(self, train=self.train.of(channels), validation=self.validation.of(channels))
+
+    @property
+    def step_error(self) -> float:
+        """U0: what the base parameters cannot absorb of a finer time step's difference."""
+        if self.train.step is None:
+            return 0.0
+        left = project(self.train.step[None], self.train.base, self.held(1.0))[0]
+        return float(left @ left / self.train.rows.counted.sum())
 
     def projected(self) -> np.ndarray:
         """[K, M] sensitivities of the training part, as the score test has them."""

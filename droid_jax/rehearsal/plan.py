@@ -11,6 +11,7 @@ import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.cost import followed
+from droid_jax.cost.errors import of_scene
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
@@ -23,6 +24,7 @@ from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 
 RATE = 200.0  # Hz, of channels that nobody measured
+SMOOTH = 0.1  # of the assumed noise, below which a channel of one repeat is taken to be no measurement
 ColumnNoise = tuple[str, str, str, float, str]  # channel, column, unit, deviation of one sample, where it comes from
 
 
@@ -123,6 +125,24 @@ def possible_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
     return tuple(name for name in SIMULATED if name != "object_angle" or seen)
 
 
+def column_noise(
+    known: Channel | None, columns: int, stated: float | None, assumed: float
+) -> tuple[np.ndarray, str, np.ndarray | None]:
+    """[C] deviation of one sample, where it comes from, and [N, T, C] how repeats scatter where that is known.
+
+    Stated before measured: by the repeats, else from row to row, unless a channel is as smooth as a command.
+    """
+    if stated is not None:
+        return np.full(columns, stated), "stated", None
+    apart = None if known is None else scattered(known)
+    if apart is not None:
+        return apart.std(axis=(0, 1)) * np.sqrt(len(apart) / (len(apart) - 1)), "repeats", apart
+    deviation = np.zeros(columns) if known is None else sample_noise(known)
+    if deviation.min() > SMOOTH * assumed:
+        return deviation, "log, from row to row", None
+    return np.full(columns, assumed), "assumed", None
+
+
 def planned_recording(
     scene: Scene, recording: Recording, rollout: Rollout, plan: RehearsalPlan, config: RehearsalConfig, seed: int
 ) -> tuple[Recording, list[ColumnNoise]]:
@@ -133,43 +153,34 @@ def planned_recording(
     """
     rng = np.random.default_rng([seed, 11])
     repeats = plan.repeats or recording.repeats
-    measured = [n for n in recording.channels if n in SIMULATED]
-    most = max((recording.channels[n].values.shape[0] for n in measured), default=1)
-    mix = rng.normal(size=(repeats, most))
+    mix = rng.normal(size=(repeats, recording.repeats))
     channels, noise = dict[str, Channel](), list[ColumnNoise]()
     for name in possible_channels(scene, recording):
-        known = recording.channels.get(name)
-        stated = (plan.noise or {}).get(name)
-        apart = None if known is None or stated is not None else scattered(known)
+        measured = recording.channels.get(name)
+        seen = None if measured is None else of_scene(scene, measured)
+        known = seen if seen is not None and seen.columns else None
+        stated = (plan.noise or {}).get(name) if plan.simulated or known is None else None
+        columns = simulated_columns(scene, name) if known is None else known.columns
+        deviation, source, apart = column_noise(known, len(columns), stated, config.noise[name])
         if known is not None and not plan.simulated:
             channels[name] = known
-            source = "repeats" if known.values.shape[0] > 1 else "log"
-            deviation = apart.std(axis=(0, 1)) if apart is not None else sample_noise(known)
-            noise += [(name, c, known.unit, float(d), source) for c, d in zip(known.columns, deviation, strict=True)]
-            continue
-        trace = getattr(rollout, name)
-        trace = trace[:, None] if trace.ndim == 1 else trace
-        if known is not None:
-            columns, time = known.columns, known.time
         else:
-            columns = (str(scene.object_joint),) if name == "object_angle" else scene.joints
-            time = recording.time[0] + np.arange(0.0, float(rollout.time[-1]), 1.0 / RATE)
-        index = [0] if name == "object_angle" else [scene.joints.index(c) for c in columns if c in scene.joints]
-        columns = columns if name == "object_angle" else tuple(scene.joints[i] for i in index)
-        clean = interpolate(time, recording.time[0] + rollout.time, np.asarray(trace, float)[:, index])
-        if stated is not None:
-            deviation, source = np.full(len(columns), stated), "stated"
-        elif apart is not None and known is not None and len(columns) == len(known.columns):
-            deviation, source = apart.std(axis=(0, 1)) * np.sqrt(len(apart) / (len(apart) - 1)), "repeats"
-        else:
-            apart = None
-            deviation, source = np.full(len(columns), config.noise[name]), "assumed"
-        values = noisy(clean, repeats, deviation, apart, rng, mix)
-        unit = known.unit if known is not None else unit_of_simulated(scene, name, columns)
-        channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
-        noise += [(name, c, unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
+            trace = np.asarray(getattr(rollout, name), float).reshape(len(rollout.time), -1)
+            which = [0] if name == "object_angle" else [scene.joints.index(c) for c in columns]
+            begin, end = float(recording.time[0]), float(rollout.time[-1])
+            time = begin + np.arange(0.0, end, 1.0 / RATE) if known is None else known.time
+            clean = interpolate(time, begin + rollout.time, trace[:, which])
+            values = noisy(clean, repeats, deviation, apart, rng, mix)
+            unit = unit_of_simulated(scene, name, columns) if known is None else known.unit
+            channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
+        noise += [(name, c, channels[name].unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
     others = {} if plan.simulated else {k: c for k, c in recording.channels.items() if k not in channels}
     return replace(recording, channels={**channels, **others}), noise
+
+
+def simulated_columns(scene: Scene, name: str) -> tuple[str, ...]:
+    """Of a channel that nobody measured."""
+    return (str(scene.object_joint),) if name == "object_angle" else scene.joints
 
 
 def noise_of_log(recording: Recording) -> list[ColumnNoise]:

@@ -17,7 +17,7 @@ from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
 from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, unhindered
 
-LEAST, MOST = 1.5, 80.0  # noncentralities between which the smallest size is looked for
+LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for
 HALVINGS = 8
 CHUNK = 4e6  # numbers of a batch of flips
 
@@ -86,13 +86,13 @@ def discrepancy_crossings(
     """
     if not model.repeated:
         return np.zeros(config.draws)
-    rng, count = np.random.default_rng([config.seed, 3, k]), model.repeats
+    rng, count, step_error = np.random.default_rng([config.seed, 3, k]), model.repeats, model.step_error
     sizes = (strength, float(np.linalg.norm(gains.added[k])) * count**0.5)
     out = np.zeros(config.draws)
     for part, factor, unit in zip((model.train, model.validation), (WORST, 1.0), sizes, strict=True):
         residuals = float(part.rows.counted.sum())
         along, beside = rng.normal(size=(2, config.draws))
-        least = count * residuals * factor * model.step_error - np.sqrt(2 * residuals) * beside
+        least = count * residuals * factor * step_error - np.sqrt(2 * residuals) * beside
         needed = np.sqrt(np.maximum(along**2 + least, 0.0)) - along
         out = np.maximum(out, np.maximum(needed, 0.0) / max(unit, 1e-30))
     return out
@@ -182,12 +182,12 @@ def _of_repeats(
     kept = value > 1e-9 * max(value.max(initial=0.0), 1e-30)
     root = deviation[:, None] * vector[:, kept] * np.sqrt(value[kept])  # [K, r]
     drawn = rng.normal(size=(config.draws, int(kept.sum()), count))
-    flips = sign_flips(count, config.seed)[: config.flips]
+    flips = sign_flips(count, config.seed)[: config.flips].astype(np.float32)
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
 
     def p_values(scores: np.ndarray, of: np.ndarray) -> np.ndarray:
         """[R] as `statistics.largest_detrended_t` has them, of scores [R, S, N]."""
-        straight = np.moveaxis(detrended(np.moveaxis(scores, 2, 0)), 0, 2)
+        straight = np.moveaxis(detrended(np.moveaxis(scores, 2, 0)), 0, 2).astype(np.float32)
         out = []
         for part in np.array_split(straight, max(1, int(straight.size * len(flips) / count / CHUNK))):
             t = np.abs(t_values(part.reshape(-1, count), flips)).reshape(len(flips), len(part), -1).max(axis=2)
@@ -217,7 +217,7 @@ def _of_blocks(
     flips = sign_flips(count, config.seed)[: config.flips]
     left = rows.left_after_flips(unit, model.train.base, held, flips)  # [F, K]
     inside = [np.flatnonzero(rows.block == b) for b in range(count)]
-    drawn = rng.normal(size=(config.draws, unit.shape[1])) * rows.counted
+    drawn = model.train.noise(config.draws, rng)
 
     def of_rows(vectors: np.ndarray, other: np.ndarray) -> np.ndarray:
         """[A, B, N] products of rows of two sets of vectors, block by block, as `Blocks.residuals` scales them."""
@@ -282,7 +282,8 @@ class GainDraws:
         level = self.model.validation.level * rows.counted.sum()
         share = selection.least_gain
         least = np.sqrt(share / (1 - share) * level / total)
-        noise = rng.normal(size=(self.config.draws, count)) * np.sqrt(squares)
+        drawn = self.model.validation.noise(self.config.draws, rng) * added
+        noise = np.stack([drawn[:, rows.block == b].sum(axis=1) for b in range(count)], axis=1)
         flips = sign_flips(count, self.config.seed, one_sided=True)
         flips = np.r_[flips[:1], rng.permutation(flips[1:])[: self.config.flips]]
 

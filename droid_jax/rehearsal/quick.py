@@ -6,6 +6,7 @@ Parameters stand where they are known; each candidate effect is simulated once w
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from droid_jax.cost.channels import SIMULATED
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, discretisation_error, refit
+from droid_jax.discrepancy.fitting import FittedModel, refit, step_difference
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
@@ -50,8 +51,8 @@ Tell = Callable[[str], None]
 class Rehearsed:
     """A linear model with what it came from.
 
-    model: of all channels that are known or assumed.  compared: those that the search compares.  refined: slopes of
-    the base parameters.  deviations: of the repeats.  noise: (channel, column, unit, deviation, source) of one sample.
+    split, case, roles: of the search.  base: the base parameters where they are known, with their slopes.
+    model: of all channels that are known or assumed.  compared: those that the search compares.  noise: of each column.
     """
 
     split: Split
@@ -98,25 +99,12 @@ def rehearsed(
     start = space.values(dict(plan.values or {}))
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
-    commanded = all(r.command.size for r in recordings)
     config = replace(config, channels=plan.channels or config.channels)
-    noise = list[ColumnNoise]()
-    made = list[Recording]()
-    if not commanded and plan.simulated:
-        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
-    as_measured = not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS)
-    for i, recording in enumerate(recordings):
-        if as_measured:
-            full, each = recording, noise_of_log(recording)
-        else:
-            rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
-            full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
-        made.append(full)
-        noise = noise or each
+    made, noise = _made(scene, whole, effects, recordings, at, plan, config, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
     split = split_of(made)
     roles = roles_of(split, made)
-    every = _alike(made) if commanded and split is not Split.WINDOWS else chosen
+    every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
     clock("case")
     needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
     case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
@@ -135,16 +123,42 @@ def rehearsed(
     else:
         beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
         validation = part_of(case.validation, beside_base, directions, base.refined.free)
-    error = 0.0
     if step_error and split is not Split.BLOCKS:
         clock("step error")
-        try:
-            error = discretisation_error(case.train, base, roles["train"])
-        except NotReplayed:
-            error = 0.0
+        with contextlib.suppress(NotReplayed):
+            train = replace(train, step=step_difference(case.train, base, roles["train"]))
     clock("")
-    model = linear_model(case, base, directions, train, validation, error)
+    model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
+
+
+def _made(
+    scene: Scene,
+    whole: Space,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    at: np.ndarray,
+    plan: RehearsalPlan,
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+) -> tuple[list[Recording], list[ColumnNoise]]:
+    """The recordings to rehearse, and the noise of the first one's columns; at: [D] where parameters stand.
+
+    Logs that are cut in time stay as they are: their noise is what fits leave of them.
+    """
+    commanded = all(r.command.size for r in recordings)
+    if not commanded and plan.simulated:
+        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
+    if not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS):
+        return list(recordings), noise_of_log(recordings[0])
+    made = list[Recording]()
+    noise = list[ColumnNoise]()
+    for i, recording in enumerate(recordings):
+        rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
+        full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        made.append(full)
+        noise = noise or each
+    return made, noise
 
 
 def _compared(
@@ -175,8 +189,11 @@ def part_of(
     names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
     channel = np.array(names)[residual_set.column]
     raw = sensitivities(residual_set, base.values, directions)
-    level = 0.0 if residual_set.resampling.repeated else base.discrepancy
-    return LinearPart(raw, base.refined.jacobian[:, free] / root, residual_set.resampling, channel, level)
+    rows, slopes = residual_set.resampling, base.refined.jacobian[:, free] / root
+    if rows.repeated:
+        return LinearPart(raw, slopes, rows, channel)
+    left = base.residuals.mean(axis=0)
+    return LinearPart(raw, slopes, rows, channel, base.discrepancy, residual=left, column=residual_set.column)
 
 
 def linear_model(
@@ -185,7 +202,6 @@ def linear_model(
     directions: Sequence[ScoreDirection],
     train: LinearPart,
     validation: LinearPart,
-    step_error: float,
 ) -> LinearModel:
     """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
     space, minimum = case.full_space, case.minimum_sizes
@@ -197,7 +213,6 @@ def linear_model(
         prior=base.refined.prior[base.refined.free],
         slack=case.train.prior_slack,
         repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
-        step_error=step_error,
         minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
         low=np.array([p.low - p.mean for p in of]),
         high=np.array([p.high - p.mean for p in of]),
@@ -226,7 +241,8 @@ def told_parameters(found: Rehearsed, model: LinearModel, more: float = 1.0) -> 
 
 def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaussian:
     rows = model.train.rows
-    deviations = [rows.deviations] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
+    # Of the mean of the repeats, as the slopes are.
+    deviations = [rows.deviations * rows.units**0.5] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
     return calibrated(refined, deviations, None, train.identifiability.pooling)
 
 
@@ -268,14 +284,16 @@ def improvements(
     faster: Rehearsed | None = None,
 ) -> list[dict[str, Any]]:
     """What more repeats, another channel or another motion would change, the most helpful first."""
-    model = found.model.of(found.compared)
-    wanted = hidden_directions(model)
+    model, every = found.model.of(found.compared), hidden_directions(found.model)
+    known, wanted = zip(*_one_each(known, every), strict=True)
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
     out = []
     for what, other, more, source in _variants(found, faster):
         if source is found and not other.repeated and more > 1:
-            after, told = before / np.sqrt(more), _recovered(found, other, rehearsal, more)
+            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
+            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
+            told = _recovered(found, other, rehearsal, more)
         else:
             sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
             after, told = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
@@ -291,6 +309,16 @@ def improvements(
             }
         )
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
+
+
+def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list[tuple[Mapping[str, Any], int]]:
+    """Of each effect the place and coefficient that is found at the smallest share of its bound."""
+    best: dict[str, tuple[Mapping[str, Any], int]] = {}
+    for entry, k in zip(known, wanted, strict=True):
+        other = best.get(entry["effect"])
+        if other is None or entry["smallest"] / entry["bound"] < other[0]["smallest"] / other[0]["bound"]:
+            best[entry["effect"]] = entry, k
+    return list(best.values())
 
 
 def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
@@ -384,7 +412,7 @@ def quick_rehearsal(
                 for row in found.noise
                 if row[0] in found.compared
             ],
-            "step_error": found.model.step_error,
+            "step_error": model.step_error,
             "level": model.train.level,
             "directions": len(model.directions),
             "rehearsal": asdict(rehearsal),
