@@ -1,17 +1,20 @@
-"""Gears that give way follow the servo that the sample has, whatever the MJCF says."""
+"""Elastic joints, and effects along a chain of bodies."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from effect_bench import ARM, mechanism
+from effect_bench import ARM, door, mechanism
 
 from droid_jax.model.effect_interface import State
+from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import servo_scale
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
+from droid_jax.model.scene import Scene, compile_scene
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.4])
@@ -37,3 +40,38 @@ def test_inside_the_play_there_is_no_torque_and_an_elastic_gear_gives_in_proport
     np.testing.assert_allclose(torque(play), 0.0, atol=1e-5)
     soft = compliance.servo({f"joint_compliance[{j}]": 1e-3 for j in ARM}, state, ctrl)
     np.testing.assert_allclose(torque(soft), 0.002 / (1.0 / stiffness + 1e-3), rtol=1e-4)
+
+
+# ----- axes and rotations of an arm's own kinematics against MuJoCo's
+
+
+@pytest.mark.parametrize(("scene", "body"), [(mechanism, "hand"), (door, "hand"), (door, "door")])
+def test_axes_and_rotation_are_mujocos(scene, body: str):
+    made: Scene = scene()
+    model, data, rng = made.model, mujoco.MjData(made.model), np.random.default_rng(0)
+    number = made.id("body", body)
+    links = turned(made, number)
+    assert links is not None
+    carried = {number}
+    while number := int(model.body_parentid[number]):
+        carried.add(number)
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    turning = [j for j in hinges if int(model.jnt_bodyid[j]) in carried]
+    assert len(turning) in (1, 2, 7)
+    for _ in range(5):
+        data.qpos[:] = rng.uniform(-1, 1, model.nq)
+        mujoco.mj_kinematics(model, data)
+        axes, rotation = links(data.qpos.astype(np.float32))
+        expected = np.zeros((model.nv, 3))
+        expected[model.jnt_dofadr[turning]] = data.xaxis[turning]
+        np.testing.assert_allclose(axes, expected, atol=2e-6)
+        np.testing.assert_allclose(rotation, data.xmat[made.id("body", body)].reshape(3, 3), atol=2e-6)
+
+
+def test_what_flies_has_none():
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body name='ball'><freejoint/><geom size='1'/>"
+        "<body name='arm'><joint name='j'/><geom size='1'/></body></body></worldbody></mujoco>"
+    )
+    scene = compile_scene(spec, "flies", joints=("j",))
+    assert turned(scene, scene.id("body", "arm")) is None
