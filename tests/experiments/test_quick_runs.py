@@ -47,11 +47,13 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/scaling.py": (),
     "benchmarks/default_run.py": (),
     "benchmarks/durations.py": (),
+    "benchmarks/excitation.py": (),
     "benchmarks/house.py": (),
     "benchmarks/kills.py": (),
     "benchmarks/lone_logs.py": (),
     "benchmarks/mujoco4.py": (),
     "benchmarks/neutral_result.py": (),
+    "benchmarks/rehearse.py": (),
     "benchmarks/robustness.py": (),
     "benchmarks/step_accuracy.py": (),
     "benchmarks/time_to_fit.py": (),
@@ -59,8 +61,9 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/peer_sysid.py": (),
 }
 READERS = ("experiments/pose_figure.py", "experiments/table1.py")  # of what identify_suite.py has left
-ELSEWHERE = {  # run by other tests
+ELSEWHERE = {  # run by other tests, or with engines that are not installed here
     "benchmarks/archive.py",
+    "benchmarks/batched_worlds.py",
     "experiments/table2.py",
     "experiments/knob_locations.py",
     "benchmarks/throughput.py",
