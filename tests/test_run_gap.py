@@ -470,7 +470,7 @@ def test_a_run_goes_on_after_a_stop_and_is_whole(
     assert lines[5] == f"report: {out / 'report.html'}"
     files = {p.name for p in out.iterdir()}
     written = {"gap.json", "gap.npz", "extended.json", "extended.xml"}
-    neutral = {"fitted.json", "apply_fit.py", "extended.patch"}
+    neutral = {"fitted.json", "apply_fit.py", "mjlab_terms.py", "extended.patch"}
     assert files == {"checkpoints", "setup.json", "tensorboard", *neutral, *written}
     assert not (out / "checkpoints" / "replays").exists()
     answer = read_gap(out).found

@@ -293,5 +293,5 @@ def test_it_is_written_whole_or_not_at_all(found: Small, tmp_path: Path):
     """gap.json comes last: where writing fails before it, no run looks finished."""
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_gap(tmp_path, found.case, found.verdict, found.own, {"seconds": float("nan")})
-    written = ["apply_fit.py", "extended.json", "extended.xml", "fitted.json", "gap.npz"]
+    written = ["apply_fit.py", "extended.json", "extended.xml", "fitted.json", "gap.npz", "mjlab_terms.py"]
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".patch") == written
