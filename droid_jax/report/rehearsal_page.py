@@ -165,6 +165,8 @@ def how_sentences(result: Result) -> list[str]:
         "The residual is taken to be linear in parameters and effects, and the robot's law to be the library's.",
         f"Recovered means that less than {percent(how['recovered_below'])} of the prior's width is left.",
     ]
+    if not result.get("full"):
+        out.append("Nothing was fitted: these sizes are predictions. Complete rehearsals (--full) check them.")
     if how["simulated"]:
         out.append("What was measured is replaced by what the scene makes of the commands, with this noise.")
     return out
