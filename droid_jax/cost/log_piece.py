@@ -215,11 +215,18 @@ def as_a_whole(
     config: CompareConfig,
     effects: Sequence[Effect],
     steps: int,
+    lead: float = 0.0,
 ) -> Piece:
-    """A repeat from its beginning, without instants that were not measured; steps: as long as it is replayed."""
+    """A repeat from its beginning, without instants that were not measured.
+
+    steps: as long as it is replayed.  lead: s, of its beginning that is not compared.
+    """
     begin = float(recording.time[0])
     last = min(begin + float(drive.time[-1]), *(float(recording.channel(n).time[-1]) for n in config.channels))
-    clocks, at = begin + np.arange(steps)[None] * drive.timestep, coarse_clock(begin, last, config.noise.rate)[None]
+    clocks, at = (
+        begin + np.arange(steps)[None] * drive.timestep,
+        coarse_clock(begin + lead, last, config.noise.rate)[None],
+    )
     values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
     kept = ~np.isnan(values[0]).any(axis=1)
     unit = np.floor((at - at[0, 0]) / STRETCH).astype(int)

@@ -212,6 +212,7 @@ def windowed_log(
     effects: Sequence[Effect] = (),
     fitted_share: float = 1.0,
     grid: float | None = None,
+    lead: float = 0.0,
 ) -> WindowedLog:
     """The cost of the repeats of commanded recordings over a space.
 
@@ -224,6 +225,8 @@ def windowed_log(
         effects: in the replays.
         fitted_share: of each repeat, whose first windows come before all that is kept as test data.
         grid: s, time steps that windows begin on; None: the scene's.
+        lead: s, at the beginning of motions that are replayed whole, which are not compared: the error of the measured
+            start fades in it.
 
     Raises:
         ValueError: what `make_cost` refuses, or no window of which enough was measured.
@@ -245,7 +248,7 @@ def windowed_log(
         for repeat in range(recording.repeats):
             of = scene, space, recording, repeat, drive, config
             if why or windows is None:
-                pieces.append(as_a_whole(*of, effects, steps))
+                pieces.append(as_a_whole(*of, effects, steps, lead))
             else:
                 pieces.append(in_windows(*of, windows, effects, grid))
     pieces = [piece for piece in pieces if piece.count]
@@ -257,7 +260,7 @@ def windowed_log(
         scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
         tuple(pieces), order, unit, fitted, why, STRETCH if windows is None or why else windows.length,
         np.ones(len(order), bool),
-        lambda scene, space, grid: windowed_log(scene, space, recordings, config, windows, (), fitted_share, grid),
+        lambda scene, space, grid: windowed_log(scene, space, recordings, config, windows, (), fitted_share, grid, lead),
     )  # fmt: skip
 
 

@@ -269,12 +269,14 @@ def windowed_case(
     share = 1.0 if test else config.blocks.fitted_share
     at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
     windows = None if at_once else config.windows
-    log = windowed_log(scene, whole, train, config.compare, windows, effects, share)
+    log = windowed_log(scene, whole, train, config.compare, windows, effects, share, lead=config.windows.lead)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
     own = per_recording_nuisances(base) if test else []
     judged = None
     if test:
-        judged = windowed_log(scene, unbounded(whole, own), test, config.compare, windows, effects)
+        judged = windowed_log(
+            scene, unbounded(whole, own), test, config.compare, windows, effects, lead=config.windows.lead
+        )
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
     first = _first_values(log, base, effects, end, rough)
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.

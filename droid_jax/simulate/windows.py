@@ -30,7 +30,7 @@ class WindowConfig:
     """How a commanded log is cut into windows.
 
     length: s, of what is compared of a window.
-    lead: s, replayed before that and not compared.
+    lead: s, replayed before that and not compared; of a motion that is replayed whole its beginning.
     history: s, of commands before the lead-in; the longest delay that it can know.
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
     """
