@@ -260,7 +260,7 @@ def windowed_log(
         scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
         tuple(pieces), order, unit, fitted, why, STRETCH if windows is None or why else windows.length,
         np.ones(len(order), bool),
-        lambda scene, space, grid: windowed_log(scene, space, recordings, config, windows, (), fitted_share, grid, lead),
+        lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, lead),
     )  # fmt: skip
 
 
