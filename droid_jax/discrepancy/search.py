@@ -26,7 +26,6 @@ from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import CONVERGE_ITERATIONS
 from droid_jax.discrepancy.fitting import (
     FittedModel,
-    beyond_step_error,
     fitted_from_prior,
     one_step_fit,
     refit,
@@ -40,7 +39,7 @@ from droid_jax.discrepancy.selection import (
     validation_tests,
     without_dominated,
 )
-from droid_jax.discrepancy.verdict import Verdict, conclude, open_share
+from droid_jax.discrepancy.verdict import Verdict, conclude, more_than_step_error, open_share
 from droid_jax.distributed import agreed
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import Progress
@@ -155,7 +154,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     found = score_test(case.train, model, asked, case.config.seed)
     thresholds = case.config.selection
     exhausted = found.p >= thresholds.significance
-    exhausted = exhausted or not beyond_step_error(model.discrepancy, problem.discretisation_error)
+    exhausted = exhausted or not more_than_step_error(case, model, found, problem.discretisation_error)
     info, notes = SelectionStep(found), Notes()
     enough = not model.parts or problem.discrepancy(model) > thresholds.least_share * problem.base_discrepancy
     if enough and not exhausted:

@@ -195,6 +195,15 @@ def _lost_narrowly(tests: Sequence[ValidationTest]) -> list[str]:
     return [f"{' or '.join(names)}, {why}" for names, why in groups if names]
 
 
+def more_than_step_error(case: Case, model: FittedModel, found: ScoreTest, discretisation_error: float) -> bool:
+    """Whether what a score test found is more than the time step could leave, U0.
+
+    U of blocks holds their noise too: there it is what the best direction takes of it.
+    """
+    share = 1.0 if case.train.resampling.repeated else float(np.max(found.explained))
+    return beyond_step_error(share * model.discrepancy, discretisation_error)
+
+
 def conclude(
     case: Case,
     base: FittedModel,
@@ -224,7 +233,7 @@ def conclude(
         model, steps = base, [replace(step, selected=None, chosen=None) for step in steps]
     discrepancies, lost = _discrepancies(case, base, model)
     missing = bool(steps) and steps[0].score_test.p < config.significance
-    missing = missing and beyond_step_error(base.discrepancy, discretisation_error)
+    missing = missing and more_than_step_error(case, base, steps[0].score_test, discretisation_error)
     alternatives = tuple(_alternatives(part.key, model, steps) for part in model.parts)
     left = remaining_residuals(case.train, case.validation, model) if converged else None
     conclusion = Conclusion.UNEXPLAINED if missing else Conclusion.NONE
