@@ -18,6 +18,7 @@ from droid_jax.discrepancy.case import Case, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit
 from droid_jax.discrepancy.search import Problem, search_effects
+from droid_jax.discrepancy.statistics import sign_flips, t_values
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import Progress
@@ -123,3 +124,13 @@ def problem_of(found: Small, deadline: float | None = None, progress: Progress =
     before = found.case.validation.discrepancy_at(found.base.values)
     asked = directions_of(candidates(found.case.effects))
     return Problem(found.case, found.base, before, FLOOR, asked, deadline, progress)
+
+
+def largest_t(scores: np.ndarray) -> tuple[np.ndarray, float]:
+    """[K] t of each of K directions with scores [K, N], and the p-value of the largest |t| among them.
+
+    As the textbook has it: the search's own tests are put beside it.
+    """
+    t = t_values(scores, sign_flips(scores.shape[1]))
+    largest = np.max(np.abs(t), axis=1)
+    return t[0], float(np.mean(largest >= largest[0] * (1 - 1e-12)))

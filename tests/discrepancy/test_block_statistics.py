@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plain_t import largest_t
+from small_gap import largest_t
 
 from droid_jax.cost.noise import DEFAULT_NOISE, coarse_clock
 from droid_jax.discrepancy.candidates import project

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from plain_t import largest_t
+from small_gap import largest_t
 
 from droid_jax.discrepancy.candidates import (
     ScoreDirection,

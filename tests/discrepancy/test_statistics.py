@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import scipy.stats
-from plain_t import largest_t
+from small_gap import largest_t
 
 from droid_jax.discrepancy.candidates import ScoreDirection, ScoreTest, trend
 from droid_jax.discrepancy.statistics import (
