@@ -116,7 +116,7 @@ def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], Full
 
     def made() -> dict[str, Any]:
         began = time.monotonic()
-        found = quick_rehearsal(where.scene, where.base, effects, recordings, plan, config, rehearsal)
+        _, found = quick_rehearsal(where.scene, where.base, effects, recordings, plan, config, rehearsal)
         return plain({**found, "code": CODE.get("git"), "whole_seconds": time.monotonic() - began})
 
     quick = kept(runs / f"quick_{name}_seed{seed}.json", made)

@@ -25,6 +25,7 @@ from droid_jax.commands.options import (
 )
 from droid_jax.commands.writer import writes
 from droid_jax.files import FIT, REHEARSAL, REHEARSAL_PAGE
+from droid_jax.storage import finite, refuse_special, write_own
 
 if TYPE_CHECKING:
     from droid_jax.discrepancy.config import DiscrepancyConfig
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from droid_jax.recordings.recording import Recording
     from droid_jax.rehearsal.linear import RehearsalConfig
     from droid_jax.rehearsal.plan import RehearsalPlan
+    from droid_jax.rehearsal.quick import Rehearsed
 
 DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
 
@@ -101,7 +103,6 @@ def run(command: Rehearse) -> None:
         warn_of_cpu(command.preset)
     from droid_jax.rehearsal.linear import RehearsalConfig
     from droid_jax.rehearsal.quick import quick_rehearsal
-    from droid_jax.storage import refuse_special, write_own
 
     refuse_special(command.out, "a folder")
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
@@ -112,10 +113,10 @@ def run(command: Rehearse) -> None:
     plan = plan_of(command, base, fit)
     effects = chosen_effects(gap, scene, [] if plan.channels else recordings)
     config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
-    result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
+    found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
     setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}
     if command.full:
-        result |= _full(command, scene, base, effects, recordings, plan, config, rehearsal, result, setup)
+        result |= _full(command, scene, base, effects, recordings, plan, config, rehearsal, found, result, setup)
     result |= {"scene": scene.name, "setup": setup, "versions": runtime.versions(), "device": runtime.device()}
     from droid_jax.report.rehearsal_page import rehearsal_page
 
@@ -192,17 +193,16 @@ def _full(
     plan: RehearsalPlan,
     config: DiscrepancyConfig,
     rehearsal: RehearsalConfig,
+    found: Rehearsed,
     quick: Mapping[str, Any],
     setup: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The complete rehearsals and their scores."""
     from droid_jax.identify.pipeline import IdentifyConfig
     from droid_jax.rehearsal.full import FullRehearsal, hidden_cases, run_cases, scores
-    from droid_jax.rehearsal.quick import rehearsed
 
     if not all(r.command.size for r in recordings):
         raise ValueError("--full needs recordings with commands: a log without them prescribes its motion")
-    found = rehearsed(scene, base, effects, recordings, plan, config, rehearsal, step_error=False)
     identify = IdentifyConfig(
         search=search_config(command.preset, command.seed), refine=refine_config(command.preset), samples=0
     )
@@ -225,7 +225,7 @@ def plain(value: Any) -> Any:
         return [plain(v) for v in value]
     if hasattr(value, "item"):
         value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return finite(value) if isinstance(value, float) else value
 
 
 def _tell(stage: str) -> None:

@@ -355,8 +355,8 @@ def quick_rehearsal(
     *,
     faster: bool = True,
     step_error: bool = True,
-) -> dict[str, Any]:
-    """What a search in these recordings would find, as plain data (rehearsal.json).
+) -> tuple[Rehearsed, dict[str, Any]]:
+    """What a search in these recordings would find.
 
     Args:
         scene: the robot.
@@ -369,6 +369,9 @@ def quick_rehearsal(
         tell: called with each stage's name.
         faster: whether a faster motion is looked at too.
         step_error: whether to measure what the time step leaves, which takes another compilation.
+
+    Returns:
+        The linear model of the search, and its answers as plain data (rehearsal.json).
 
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
@@ -396,7 +399,7 @@ def quick_rehearsal(
     told = told_parameters(found, model)
     of = {p.name: p for p in found.base.space.parameters}
     at = dict(zip(found.case.full_space.names, found.base.values, strict=True))
-    return {
+    answer = {
         "format": "droid_jax rehearsal 1",
         "form": "quick",
         "recordings": [r.name for r in recordings],
@@ -436,6 +439,7 @@ def quick_rehearsal(
         "helps": helps,
         "seconds": {**dict(found.seconds), "whole": time.monotonic() - began},
     }
+    return found, answer
 
 
 class _Stopwatch:

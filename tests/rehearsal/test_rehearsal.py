@@ -199,7 +199,7 @@ def hinge() -> tuple[Scene, Space]:
 def result(hinge) -> dict[str, Any]:
     scene, space = hinge
     recordings = [motion(), motion("validation", 1.0)]
-    return quick_rehearsal(scene, space, library(scene, EFFECTS), recordings, PLAN, faster=False, step_error=False)
+    return quick_rehearsal(scene, space, library(scene, EFFECTS), recordings, PLAN, faster=False, step_error=False)[1]
 
 
 def entry(result: dict[str, Any], effect: str) -> dict[str, Any]:
@@ -296,7 +296,7 @@ def test_a_synthetic_log_holds_what_was_hidden_and_the_stated_noise(hinge):
 
 def test_page_and_json_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], hinge, result, monkeypatch):
     """The files; the answer itself is the module's."""
-    monkeypatch.setattr("droid_jax.rehearsal.quick.quick_rehearsal", lambda *args, **kwargs: dict(result))
+    monkeypatch.setattr("droid_jax.rehearsal.quick.quick_rehearsal", lambda *args, **kwargs: (None, dict(result)))
     save_recording(motion(), tmp_path / "log.npz")
     (tmp_path / "parameters.json").write_text(json.dumps(PARAMETERS))
     options = ["--scene", HINGE, "--object-joint", "door", "--parameters", tmp_path / "parameters.json",
