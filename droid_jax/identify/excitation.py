@@ -25,7 +25,13 @@ from droid_jax.cost.residuals import CompareConfig, Comparison
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.holdout import beginning
 from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability, posterior
-from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, curvature
+from droid_jax.identify.levenberg_marquardt import (
+    LevenbergMarquardtConfig,
+    curvature,
+    damped_steps,
+    off_bounds,
+    penalised,
+)
 from droid_jax.identify.multistart import Refined
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
@@ -196,47 +202,28 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
         if not all(bool(np.all(rollout.finite)) for rollout in first):
             raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
         residuals = cost.whitened_of(rollouts)
-        now = _objective(residuals[:1], x[None], prior)[0]
+        now = penalised(x[None], np.float64(residuals[:1]), prior)[0]
         jacobian = jacobian_of(residuals, steps)
         slope = jacobian.T @ residuals[0] + x / prior**2
-        free = ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))  # of bounds that a step would cross
-        trials = np.clip(x + _trials(jacobian, slope, free, prior, config), low, high)
+        free = off_bounds(x, slope, low, high)
+        steps_of = curvature(jacobian, prior), slope, free, DAMPINGS, LENGTHS, config.longest_step
+        trials = np.clip(x + damped_steps(*steps_of), low, high)
         if count == config.steps:
             break
-        reached = _objective(cost.whitened(space.from_search(trials)), trials, prior)
+        reached = penalised(trials, np.float64(cost.whitened(space.from_search(trials))), prior)
         if not np.min(reached) < (1 - config.worth) * now:
             break
         x, count = trials[int(np.argmin(reached))], count + 1
     stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
     cost = cost.compared_by(stated)
     residuals = cost.whitened_of(rollouts)
-    objective = float(_objective(residuals[:1], x[None], prior)[0])
+    objective = float(penalised(x[None], np.float64(residuals[:1]), prior)[0])
     refined = Refined(
         space=space, x=x, best=space.from_search(x), objective=objective, residual=residuals[0],
         jacobian=jacobian_of(residuals, steps), prior=prior, starts=np.array([objective]),
         evaluations=(count + 1) * (len(x) + 1), iterations=count, converged=False,
     )  # fmt: skip
     return refined, cost
-
-
-def _objective(residuals: np.ndarray, x: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """[P] of rows [P, M] at search coordinates [P, D]; infinite where a replay failed."""
-    value = 0.5 * np.sum(np.asarray(residuals, np.float64) ** 2, axis=1) + 0.5 * np.sum((x / prior) ** 2, axis=1)
-    return np.where(np.isfinite(value), value, np.inf)
-
-
-def _trials(
-    jacobian: np.ndarray, slope: np.ndarray, free: np.ndarray, prior: np.ndarray, config: ExcitationConfig
-) -> np.ndarray:
-    """[P, D] steps of the parameters that are free [D], more or less damped, long and short."""
-    hessian = curvature(jacobian, prior)
-    found = list[np.ndarray]()
-    for damping in DAMPINGS:
-        damped, step = hessian + damping * np.diag(np.diag(hessian)), np.zeros(len(slope))
-        step[free] = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-        step *= min(1.0, config.longest_step / max(float(np.abs(step).max(initial=0.0)), 1e-12))
-        found += [length * step for length in LENGTHS]
-    return np.array(found)
 
 
 def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict[str, float]]:

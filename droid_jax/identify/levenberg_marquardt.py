@@ -9,7 +9,7 @@ straight in physical units alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -95,6 +95,38 @@ def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return jacobian.T @ jacobian + np.diag(prior**-2)
 
 
+def penalised(x: np.ndarray, residual: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """[P] objective of residuals [P, M] at search coordinates [P, D]; infinite where a replay gave no numbers."""
+    value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / prior) ** 2, axis=-1)
+    return np.where(np.isfinite(value), value, np.inf)
+
+
+def off_bounds(x: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[D] bool, coordinates that a step down the slope [D] does not push over a bound that they sit on."""
+    return ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))
+
+
+def damped_steps(
+    hessian: np.ndarray,
+    slope: np.ndarray,
+    free: np.ndarray,
+    dampings: Sequence[float],
+    lengths: Sequence[float],
+    longest: float,
+) -> np.ndarray:
+    """[dampings * lengths, D] Levenberg-Marquardt steps of the free coordinates [D], no component beyond `longest`.
+
+    dampings: shares of the curvature's diagonal.  lengths: shares of each whole step.
+    """
+    out = np.zeros((len(dampings), len(lengths), len(slope)))
+    for k, damping in enumerate(dampings):
+        damped = hessian + damping * np.diag(np.diag(hessian))
+        step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
+        step *= min(1.0, longest / max(np.max(np.abs(step), initial=0.0), 1e-12))
+        out[k][:, free] = np.outer(lengths, step)
+    return out.reshape(-1, len(slope))
+
+
 def principal_axes(cov: np.ndarray, longest: float) -> np.ndarray:
     """[D, D] columns: principal axes of a covariance, one deviation long, no entry beyond `longest`."""
     variance, axes = np.linalg.eigh(cov)
@@ -148,8 +180,7 @@ class DampedProblem:
 
     def objective(self, x: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """[P]; infinite where a replay gave no numbers."""
-        value = 0.5 * np.sum(residual**2, axis=-1) + 0.5 * np.sum((x / self.prior) ** 2, axis=-1)
-        return np.where(np.isfinite(value), value, np.inf)
+        return penalised(x, residual, self.prior)
 
     def start(self, x: np.ndarray) -> Starts:
         """The state of fresh starts [S, D]."""
@@ -235,17 +266,11 @@ class DampedProblem:
         x, dampings, lengths = state.x[0], self._config.dampings, self._config.lengths
         if not np.isfinite(state.objective[0]):
             return np.zeros((len(dampings) * len(lengths), len(x)))
-        hessian = curvature(jacobian, self.prior)
         slope = jacobian.T @ state.residual[0] + x / self.prior**2
-        free = ~(((x <= self.low) & (slope > 0)) | ((x >= self.high) & (slope < 0)))
+        free = off_bounds(x, slope, self.low, self.high)
         free &= True if held is None else ~held[row]
-        out = np.zeros((len(dampings), len(lengths), len(x)))
-        for k, factor in enumerate(dampings):
-            damped = hessian + state.damping[0] * factor * np.diag(np.diag(hessian))
-            step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-            step *= min(1.0, self._config.longest_step / max(np.max(np.abs(step), initial=0.0), 1e-12))
-            out[k][:, free] = np.outer(lengths, step)
-        return out.reshape(-1, len(x))
+        own = [state.damping[0] * factor for factor in dampings]
+        return damped_steps(curvature(jacobian, self.prior), slope, free, own, lengths, self._config.longest_step)
 
     def _straight(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """x moved by `step` along straight lines in physical units instead of search coordinates."""
