@@ -202,7 +202,7 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
         if not all(bool(np.all(rollout.finite)) for rollout in first):
             raise ValueError("the simulation blows up at the parameters' initial means: shorten the time step")
         residuals = cost.whitened_of(rollouts)
-        now = penalised(x[None], np.float64(residuals[:1]), prior)[0]
+        now = penalised(x[None], np.asarray(residuals[:1], np.float64), prior)[0]
         jacobian = jacobian_of(residuals, steps)
         slope = jacobian.T @ residuals[0] + x / prior**2
         free = off_bounds(x, slope, low, high)
@@ -210,14 +210,14 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
         trials = np.clip(x + damped_steps(*steps_of), low, high)
         if count == config.steps:
             break
-        reached = penalised(trials, np.float64(cost.whitened(space.from_search(trials))), prior)
+        reached = penalised(trials, np.asarray(cost.whitened(space.from_search(trials)), np.float64), prior)
         if not np.min(reached) < (1 - config.worth) * now:
             break
         x, count = trials[int(np.argmin(reached))], count + 1
     stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
     cost = cost.compared_by(stated)
     residuals = cost.whitened_of(rollouts)
-    objective = float(penalised(x[None], np.float64(residuals[:1]), prior)[0])
+    objective = float(penalised(x[None], np.asarray(residuals[:1], np.float64), prior)[0])
     refined = Refined(
         space=space, x=x, best=space.from_search(x), objective=objective, residual=residuals[0],
         jacobian=jacobian_of(residuals, steps), prior=prior, starts=np.array([objective]),
