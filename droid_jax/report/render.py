@@ -247,7 +247,9 @@ def _draw(folder: Path | None) -> None:
     data, option, images = mujoco.MjData(model), mujoco.MjvOption(), []
     if not (model.geom_bodyid > 0).any():  # kinematics and inertias alone: boxes of the inertias and joints are drawn
         option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = option.flags[mujoco.mjtVisFlag.mjVIS_JOINT] = True
+        option.flags[mujoco.mjtVisFlag.mjVIS_COM] = True
         model.vis.rgba.inertia, model.vis.headlight.ambient = (0.75, 0.8, 0.9, 1.0), (0.5, 0.5, 0.5)
+        _seen_whole(model, data)
     with mujoco.Renderer(model, *view["size"]) as renderer:
         for state in np.load(folder / "states.npy"):
             data.qpos[:] = state
@@ -256,6 +258,18 @@ def _draw(folder: Path | None) -> None:
             renderer.update_scene(data, scene_option=option, **camera)
             images.append(renderer.render())
     np.save(folder / "frames.npy", np.stack(images))
+
+
+def _seen_whole(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Let the camera and the size of marks follow joints and centres of mass: MuJoCo's extent is too large for some."""
+    import mujoco
+
+    mujoco.mj_forward(model, data)
+    points = np.concatenate([data.xanchor, data.xipos[1:]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = 2.0 * max(float(np.linalg.norm(high - low)), 0.05)  # to both sides of a pendulum
+    if extent < model.stat.extent:
+        model.stat.center, model.stat.extent, model.stat.meansize = 0.5 * (low + high), extent, 0.1 * extent
 
 
 if __name__ == "__main__":

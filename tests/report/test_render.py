@@ -52,6 +52,15 @@ def test_a_model_without_geoms_shows_its_inertias() -> None:
     assert np.ptp(image) > 60
 
 
+def test_a_point_mass_is_seen_where_it_swings() -> None:
+    _backend()
+    body = "<body><joint axis='0 1 0'/><inertial pos='0 0 -.1' mass='1' diaginertia='1e-6 1e-6 1e-6'/></body>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    hanging, raised = render.rendered_frames(model, np.array([[0.0], [1.5]]), [0, 1], None, size=(48, 64))
+    bright = [np.argwhere(image.max(axis=2) > 120).mean(axis=0) for image in (hanging, raised)]
+    assert bright[1][0] < bright[0][0] - 3  # higher up in the picture
+
+
 def test_frames_refuse_what_does_not_fit_the_model() -> None:
     import mujoco
 
