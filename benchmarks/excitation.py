@@ -135,7 +135,7 @@ def identifiable(scene: Scene, space: Space, recordings: Sequence[Recording]) ->
 
 def said(found: Excitation) -> dict[str, bool]:
     """What the check says."""
-    return {t.name: t.identifiable for t in found.told}
+    return {t.name: t.identifiable for t in found.identifiability}
 
 
 def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
         clock, command = proposal.commands()
         after = identifiable(scene, space, [log, recorded("added", model, clock, command, seed + 1)])
         row |= {"added": [a.what for a in proposal.chosen], "added_s": proposal.seconds, "after": after}
-        row["told_by_it"] = list(proposal.opened)
+        row["identifiable_by_it"] = list(proposal.opened)
     return row
 
 
@@ -186,13 +186,13 @@ def main(command: Compared) -> dict[str, Any]:
 def summary(rows: list[dict[str, Any]], panda: dict[str, Any] | None) -> dict[str, Any]:
     """What is published of the motions, and of the Panda."""
     agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
-    added = [(row["after"][n]) for row in rows if "after" in row for n in row["told_by_it"]]
+    added = [(row["after"][n]) for row in rows if "after" in row for n in row["identifiable_by_it"]]
     opened = [n for row in rows for n, known in row["said"].items() if not known]
     result = {
         "parameters_judged": len(agreeing),
         "agreement": float(np.mean(agreeing)),
         "open_before": len(opened),
-        "told_by_addition": len(added),
+        "identifiable_by_addition": len(added),
         "addition_confirmed": float(np.mean(added)) if added else None,
         "slowest_s": max(row["seconds"] for row in rows),
         "motions": rows,

@@ -139,7 +139,7 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     told = json.loads((out / "check.json").read_text())["excitation"]
     assert told["engine"] == "mujoco"
     open_ones = {p["name"] for p in told["parameters"] if not p["identifiable"]}
-    assert open_ones == {"elbow_damping"} == {*told["told_by_it"]} and told["left_open"] == []
+    assert open_ones == {"elbow_damping"} == {*told["identifiable_by_it"]} and told["left_open"] == []
     assert told["addition"]
     said = " ".join(capsys.readouterr().out.split())
     assert "What these recordings tell of the parameters" in said and "record besides" in said

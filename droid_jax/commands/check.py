@@ -73,22 +73,22 @@ def run(command: CheckCommand) -> None:
         checked.append((recording, contents(recording), inspect_log(recording, scene, cutoff)))
     for recording, tracks, findings in checked:
         _show(recording, tracks, findings)
-    told, why = None, ""
+    excited, why = None, ""
     if any(finding.severity == "certain" for _, _, findings in checked for finding in findings):
         why = "a finding is certain"
     elif command.parameters is not None:
         try:
-            told = _excitation(command, recordings)
+            excited = _excitation(command, recordings)
         except ValueError as error:  # of the replay: what was found above is said all the same
             why = str(error)
     if command.parameters is not None and why:
         print(f"which parameters these recordings tell was not looked at: {why}")
-    if told is not None:
-        _show_told(*told)
-    page = check_page(checked, None if command.scene is None else command.scene.stem, told)
-    files = {"check.json": _json(command, checked, told), "check.html": page.encode()}
-    if told is not None and told[1].chosen:
-        files[ADDITION] = _csv(told[1])
+    if excited is not None:
+        _show_excitation(*excited)
+    page = check_page(checked, None if command.scene is None else command.scene.stem, excited)
+    files = {"check.json": _json(command, checked, excited), "check.html": page.encode()}
+    if excited is not None and excited[1].chosen:
+        files[ADDITION] = _csv(excited[1])
         print(f"the motion, as commands: {command.out / ADDITION}; see that its way is free")
     write_own(command.out, files)
     print(f"page: {command.out / 'check.html'}")
@@ -115,7 +115,7 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
     return found, propose(scene, space, found, recordings[0])
 
 
-def _show_told(found: Excitation, proposal: MotionProposal) -> None:
+def _show_excitation(found: Excitation, proposal: MotionProposal) -> None:
     """The table of parameters on the terminal, and the sentence below it."""
     from rich.console import Console
     from rich.table import Table
@@ -125,9 +125,14 @@ def _show_told(found: Excitation, proposal: MotionProposal) -> None:
     table = Table(title=Text("What these recordings tell of the parameters, before a fit"))
     for name in ("parameter", "unit", "of the prior's width left", "identifiable", "trades with"):
         table.add_column(name, overflow="fold")
-    for parameter, told in zip(found.space.parameters, found.told, strict=True):
-        partners = ", ".join(f"{name} ({value:+.2f})" for name, value in told.partners)
-        cells = (parameter.name, parameter.unit, f"{100 * told.shrinkage:.0f} %", "yes" if told.identifiable else "no")
+    for parameter, verdict in zip(found.space.parameters, found.identifiability, strict=True):
+        partners = ", ".join(f"{name} ({value:+.2f})" for name, value in verdict.partners)
+        cells = (
+            parameter.name,
+            parameter.unit,
+            f"{100 * verdict.shrinkage:.0f} %",
+            "yes" if verdict.identifiable else "no",
+        )
         table.add_row(*map(Text, (*cells, partners)))
     console.print(table)
     console.print(Text(proposal.sentence))
@@ -174,7 +179,7 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
 def _json(
     command: CheckCommand,
     checked: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
-    told: tuple[Excitation, MotionProposal] | None,
+    excited: tuple[Excitation, MotionProposal] | None,
 ) -> bytes:
     """The content of check.json."""
     import json
@@ -199,15 +204,15 @@ def _json(
         "format": "droid_jax check 1",
         "scene": None if command.scene is None else str(command.scene),
     }
-    if told is not None:
-        found, proposal = told
+    if excited is not None:
+        found, proposal = excited
         whole["excitation"] = {
-            "parameters": [column(asdict(t)) for t in found.told],
+            "parameters": [column(asdict(t)) for t in found.identifiability],
             "engine": found.engine,
             "seconds": found.seconds,
             "sentence": proposal.sentence,
             "addition": [a.what for a in proposal.chosen],
-            "told_by_it": list(proposal.opened),
+            "identifiable_by_it": list(proposal.opened),
             "left_open": list(proposal.left),
         }
     return (json.dumps({**whole, "recordings": recordings}, indent=1, allow_nan=False) + "\n").encode()

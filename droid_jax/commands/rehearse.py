@@ -42,7 +42,8 @@ DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is g
 
 @dataclass(frozen=True)
 class Rehearse:
-    """Would this work on my robot, with this motion? Which parameters and effects could be told, and from which size.
+    """Would this work on my robot, with this motion? Which parameters would be identifiable, which effects
+    found, and from which size?
 
     Quick, without fits: from what each parameter and each effect changes, beside the noise. --full makes synthetic
     logs with something hidden, and fits and searches them.

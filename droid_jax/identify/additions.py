@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from droid_jax.cost.cost import make_cost
-from droid_jax.identify.excitation import Excitation, jacobian_of, silent, slopes, told_by
+from droid_jax.identify.excitation import Excitation, identifiability_of, jacobian_of, silent, slopes
 from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
@@ -51,13 +51,13 @@ class Addition:
 class MotionProposal:
     """What to record besides.
 
-    chosen: in the order in which they were picked.  told: of each parameter with them.  opened: the names that they
-    make identifiable.  left: those that stay open.  joints, start: [U] of the commands, and where they begin, rad or m.
-    tried: candidates.
+    chosen: in the order in which they were picked.  identifiability: of each parameter with them.
+    opened: the names that they make identifiable.  left: those that stay open.  tried: candidates.
+    joints, start: [U] of the commands, and where they begin, rad or m.
     """
 
     chosen: tuple[Addition, ...]
-    told: tuple[Identifiability, ...]
+    identifiability: tuple[Identifiability, ...]
     opened: tuple[str, ...]
     left: tuple[str, ...]
     joints: tuple[str, ...]
@@ -152,11 +152,11 @@ def propose(
     main = ~space.nuisance
     chosen, total = list[Addition](), found.information
 
-    def told(information: np.ndarray) -> tuple[Identifiability, ...]:
-        return told_by(space, information, found.config.identifiability)
+    def judged(information: np.ndarray) -> tuple[Identifiability, ...]:
+        return identifiability_of(space, information, found.config.identifiability)
 
     def widths(information: np.ndarray) -> np.ndarray:
-        reached = np.array([t.shrinkage for t in told(information)])[main]
+        reached = np.array([t.shrinkage for t in judged(information)])[main]
         return np.log(np.maximum(reached, MARGIN * limit))
 
     each = _information(scene, space, found, recording, candidates) if found.open and candidates else {}
@@ -173,13 +173,13 @@ def propose(
         if np.all(widths(rest) <= np.maximum(widths(total), np.log(limit * MARGIN))):
             chosen.remove(picked)
             total = rest
-    after = told(total)
+    after = judged(total)
     now = {t.name for t in after if t.identifiable}
     if not now.intersection(found.open):  # narrower, but none of them enough
-        chosen, after = [], told(found.information)
+        chosen, after = [], judged(found.information)
     return MotionProposal(
         chosen=tuple(chosen),
-        told=after,
+        identifiability=after,
         opened=tuple(name for name in found.open if name in now),
         left=tuple(name for name in found.open if name not in now),
         joints=joints,

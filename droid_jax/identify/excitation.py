@@ -82,7 +82,7 @@ class Excitation:
     values: [D] where the replay was differentiated.
     information: [D, D] of the data, per squared search unit, by the fit's rule of the width.
     widening: [D] factors by which that rule widens deviations.
-    told: of each parameter.
+    identifiability: of each parameter.
     noise: channel -> joint -> white deviation at the noise model's coarse rate.
     config: with the channels that were compared.  engine: that replayed.  seconds: that this took.
     """
@@ -91,7 +91,7 @@ class Excitation:
     values: np.ndarray
     information: np.ndarray
     widening: np.ndarray
-    told: tuple[Identifiability, ...]
+    identifiability: tuple[Identifiability, ...]
     noise: Mapping[str, Mapping[str, float]]
     config: ExcitationConfig
     engine: str
@@ -101,7 +101,9 @@ class Excitation:
     def open(self) -> tuple[str, ...]:
         """Names of the parameters of interest that are not identifiable."""
         return tuple(
-            t.name for t, p in zip(self.told, self.space.parameters, strict=True) if not (t.identifiable or p.nuisance)
+            t.name
+            for t, p in zip(self.identifiability, self.space.parameters, strict=True)
+            if not (t.identifiable or p.nuisance)
         )
 
 
@@ -143,7 +145,7 @@ def excitation(
         values=refined.best,
         information=information,
         widening=np.sqrt(np.maximum(1.0, np.diag(gaussian.cov) / np.diag(plain))),
-        told=told_by(space, information, config.identifiability),
+        identifiability=identifiability_of(space, information, config.identifiability),
         noise=_noise_of(scene, cost.comparisons),
         config=config,
         engine=engine,
@@ -151,7 +153,9 @@ def excitation(
     )
 
 
-def told_by(space: Space, information: np.ndarray, config: IdentifiabilityConfig) -> tuple[Identifiability, ...]:
+def identifiability_of(
+    space: Space, information: np.ndarray, config: IdentifiabilityConfig
+) -> tuple[Identifiability, ...]:
     """What data of an information [D, D], per squared search unit, tell of each parameter beside its stated prior."""
     cov = np.linalg.inv(information + np.eye(len(space)))
     gaussian = Gaussian(space, np.zeros(len(space)), 0.5 * (cov + cov.T), "sensitivity beside the stated prior")

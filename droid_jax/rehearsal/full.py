@@ -351,7 +351,7 @@ def judged_parameters(of: FullRehearsal, logs: Sequence[Recording], values: np.n
         of.scene, main, list(logs[:1]), nuisances=nuisances if len(nuisances) else None, config=config
     )
     low, high = found.full_gaussian.interval(LEVEL)
-    told = {t.name: t for t in found.identifiability}
+    verdicts = {t.name: t for t in found.identifiability}
     best = dict(zip(found.full.names, found.best, strict=True))
     out = []
     for k, name in enumerate(found.full_gaussian.space.names):
@@ -365,7 +365,7 @@ def judged_parameters(of: FullRehearsal, logs: Sequence[Recording], values: np.n
                 "value": float(best[name]),
                 "interval": [float(low[k]), float(high[k])],
                 "holds": bool(low[k] <= truth <= high[k]),
-                "recovered": bool(told[name].identifiable) if name in told else False,
+                "recovered": bool(verdicts[name].identifiable) if name in verdicts else False,
             }
         )
     return out
@@ -411,7 +411,7 @@ def scores(results: Sequence[Mapping[str, Any]], share: float) -> dict[str, Any]
                 "same_law": mine[0]["same_law"],
             }
         )
-    told = [p for r in empty for p in r.get("parameters", ())]
+    verdicts = [p for r in empty for p in r.get("parameters", ())]
     parameters = [
         {
             "name": name,
@@ -419,8 +419,8 @@ def scores(results: Sequence[Mapping[str, Any]], share: float) -> dict[str, Any]
             "recovered": sum(p["recovered"] for p in mine),
             "holds": sum(p["holds"] for p in mine),
         }
-        for name in dict.fromkeys(p["name"] for p in told)
-        if (mine := [p for p in told if p["name"] == name])
+        for name in dict.fromkeys(p["name"] for p in verdicts)
+        if (mine := [p for p in verdicts if p["name"] == name])
     ]
     return {
         "cases": len(results),

@@ -227,7 +227,7 @@ def hidden_directions(model: LinearModel) -> list[int]:
     return [rows[len(rows) // 2] for rows in groups.values()]
 
 
-def told_parameters(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
+def parameter_identifiability(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
     """What the recordings would say of each base parameter; more: times as many of them."""
     refined, train = found.base.refined, found.case.train
     seen = np.isin(found.model.train.channel, np.unique(model.train.channel))
@@ -293,10 +293,10 @@ def improvements(
         if source is found and not other.repeated and more > 1:
             needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
             after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
-            told = _recovered(found, other, rehearsal, more)
+            now = _recovered(found, other, rehearsal, more)
         else:
             sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
-            after, told = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
+            after, now = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
         both = np.isfinite(before) & np.isfinite(after)
         ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
         out.append(
@@ -305,7 +305,7 @@ def improvements(
                 "times_smaller": ratio,
                 "newly_found": int(np.sum(~np.isfinite(before) & np.isfinite(after))),
                 "lost": int(np.sum(np.isfinite(before) & ~np.isfinite(after))),
-                "recovered_more": told - recovered,
+                "recovered_more": now - recovered,
             }
         )
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
@@ -337,10 +337,10 @@ def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str,
 
 
 def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
-    told = told_parameters(found, model, more)
+    verdicts = parameter_identifiability(found, model, more)
     limit = rehearsal.recovered or found.case.train.identifiability.identifiable
     nuisance = dict(zip(found.base.space.names, found.base.space.nuisance, strict=True))
-    return sum(t.shrinkage < limit for t in told if not nuisance[t.name])
+    return sum(t.shrinkage < limit for t in verdicts if not nuisance[t.name])
 
 
 def quick_rehearsal(
@@ -396,7 +396,7 @@ def quick_rehearsal(
     tell("improvements")
     helps = improvements(found, known, config, rehearsal, other)
     limit = rehearsal.recovered or config.identifiability.identifiable
-    told = told_parameters(found, model)
+    verdicts = parameter_identifiability(found, model)
     of = {p.name: p for p in found.base.space.parameters}
     at = dict(zip(found.case.full_space.names, found.base.values, strict=True))
     answer = {
@@ -433,7 +433,7 @@ def quick_rehearsal(
                 "recovered": bool(t.shrinkage < limit),
                 "partners": [list(p) for p in t.partners],
             }
-            for t in told
+            for t in verdicts
         ],
         "effects": known,
         "helps": helps,

@@ -35,18 +35,21 @@ MOST = 12  # joints that are drawn
 def check_page(
     recordings: Sequence[tuple[Recording, Sequence[Signal], Sequence[Finding]]],
     scene: str | None,
-    told: tuple[Excitation, MotionProposal] | None = None,
+    excited: tuple[Excitation, MotionProposal] | None = None,
 ) -> str:
     """HTML of recordings with what they hold and what was found in them.
 
-    scene: the name of the one they are for.  told: which parameters they tell, and what would tell the rest.
+    scene: the name of the one they are for.  excited: which parameters are identifiable in them, and
+    what would make the rest so.
     """
     parts: list[dict[str, Any]] = []
     for i, (recording, tracks, findings) in enumerate(recordings):
         figure = Markup(inline_svg(settled(signals(recording)), f"f{i}"))
         parts.append({"recording": recording, "tracks": tracks, "findings": findings, "figure": figure})
-    rows = [] if told is None else list(zip(told[0].space.parameters, told[0].told, strict=True))
-    return html("check.html.jinja", parts=parts, scene=scene, rows=rows, sentence=told[1].sentence if told else "")
+    rows = [] if excited is None else list(zip(excited[0].space.parameters, excited[0].identifiability, strict=True))
+    return html(
+        "check.html.jinja", parts=parts, scene=scene, rows=rows, sentence=excited[1].sentence if excited else ""
+    )
 
 
 @styled
