@@ -24,7 +24,7 @@ from droid_jax.simulate.batching import block_size
 from droid_jax.simulate.compiled import window_program
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.servo_gains import servo_factors
-from droid_jax.simulate.windows import WindowConfig, Windows, cut
+from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
 LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
@@ -88,9 +88,12 @@ class Piece:
         return {**{name: getattr(rollout, name)[of, rows] for name in TRACES}, "finite": rollout.finite.astype(bool)}
 
     def spread(self, values: np.ndarray) -> np.ndarray | None:
-        """[W, K, all C, 2 nv] what each column of the states' spread does to the simulation at `values` [D]."""
+        """[W, K, all C, 2 nv] what each column of the states' spread does to the simulation at `values` [D].
+
+        None where there is none.
+        """
         windows = self.windows
-        if self.whole:
+        if not windows.spread.any():
             return None
         dofs, positions = windows.speed.shape[1], windows.start.shape[1]
         assert dofs == positions  # joints of one degree, in one order
@@ -213,19 +216,20 @@ def as_a_whole(
     repeat: int,
     drive: Drive,
     config: CompareConfig,
+    windows: WindowConfig,
     effects: Sequence[Effect],
     steps: int,
-    lead: float = 0.0,
 ) -> Piece:
     """A repeat from its beginning, without instants that were not measured.
 
-    steps: as long as it is replayed.  lead: s, of its beginning that is not compared.
+    steps: as long as it is replayed.  windows: `lead` of the beginning is not compared; `reach` tells how far the start
+    may be off, but not where an object is gripped, whose contacts change with it.
     """
     begin = float(recording.time[0])
     last = min(begin + float(drive.time[-1]), *(float(recording.channel(n).time[-1]) for n in config.channels))
     clocks, at = (
         begin + np.arange(steps)[None] * drive.timestep,
-        coarse_clock(begin + lead, last, config.noise.rate)[None],
+        coarse_clock(begin + windows.lead, last, config.noise.rate)[None],
     )
     values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
     kept = ~np.isnan(values[0]).any(axis=1)
@@ -234,9 +238,12 @@ def as_a_whole(
     filters = {key: tuple(f[kept] for f in each[0]) for key, each in passed.items()}
     table = np.concatenate([drive.command, np.repeat(drive.command[-1:], steps - len(drive.command), axis=0)])
     size = scene.model.nv
+    spread = np.zeros((2 * size, 2 * size))
+    if scene.grip is None:
+        spread = start_spread(scene, recording, drive.qpos0, repeat, drive.timestep, windows)
     motion = Windows(
         np.zeros(1), table[None], servo_factors(scene, drive)[None], drive.qpos0[None], np.zeros((1, size)),
-        np.zeros((1, 2 * size, 2 * size)), 0, steps,
+        spread[None], 0, steps,
     )  # fmt: skip
     program = window_program(scene, space, drive, effects, 0, steps)
     cut_to = (a[:, kept] for a in (values, at, _nearest(at, clocks, drive), unit))

@@ -38,6 +38,27 @@ class PooledComparison(Comparison):
 
 
 @dataclass(frozen=True, eq=False)
+class Whitener:
+    """The inverse root of a piece's covariance, diag(deviation^2) + s s': I - left shrink left' over the deviation.
+
+    deviation: [C].  left: [W, K C, R], column by column, orthonormal in units of it; shrink: [W, R].  None: no spread.
+    """
+
+    deviation: np.ndarray
+    left: np.ndarray | None = None
+    shrink: np.ndarray | None = None
+
+    def __call__(self, left: np.ndarray) -> np.ndarray:
+        """[P, W, K, C] residuals, whitened."""
+        flat = np.swapaxes(left / self.deviation, 2, 3)
+        if self.left is not None and self.shrink is not None:
+            white = flat.reshape(*left.shape[:2], -1)
+            taken = self.shrink * np.einsum("wir,pwi->pwr", self.left, white, optimize=True)
+            flat = (white - np.einsum("wir,pwr->pwi", self.left, taken, optimize=True)).reshape(flat.shape)
+        return np.swapaxes(flat, 2, 3)
+
+
+@dataclass(frozen=True, eq=False)
 class WindowedLog(Cost):
     """The cost of pooled logs.
 
@@ -58,7 +79,7 @@ class WindowedLog(Cost):
     unit_seconds: float
     instants: np.ndarray
     again: Callable[[Scene, Space, float], WindowedLog]
-    whitener: tuple[np.ndarray, ...] | None = None
+    whitener: tuple[Whitener, ...] | None = None
     spreads: tuple[np.ndarray | None, ...] = field(default=())
 
     def simulated(self, values: Any) -> np.ndarray:
@@ -93,12 +114,7 @@ class WindowedLog(Cost):
         """[P, D] -> [P, M] residuals in units of the noise stated, zero at instants left out."""
         assert self.whitener is not None
         left = self.simulated(values) - self.measured
-        white = []
-        for part, matrix in zip(self._apart(left), self.whitener, strict=True):
-            flat = np.swapaxes(part, 2, 3).reshape(*part.shape[:2], -1)  # column by column
-            diagonal = matrix.ndim == 2  # [1, K C]
-            done = flat * matrix if diagonal else np.einsum("wij,pwj->pwi", matrix, flat, optimize=True)
-            white.append(np.swapaxes(done.reshape(*part.shape[:2], part.shape[3], part.shape[2]), 2, 3))
+        white = [make(part) for part, make in zip(self._apart(left), self.whitener, strict=True)]
         rows = self._joined(white) * self.instants[:, None]
         return np.swapaxes(rows, 1, 2).reshape(len(rows), -1)
 
@@ -185,22 +201,22 @@ class WindowedLog(Cost):
         """With white noise of a deviation [C], in the columns' units, and the spread of `about`, at some instants [K]
         bool; the rest does not count."""
         deviation = np.maximum(deviation, self.least_noise())
+        counted = self._apart(instants[None, :, None])
         spreads = self.spreads or (None,) * len(self.pieces)
-        whitener = tuple(_whitener(p.at.shape[1], deviation, s) for p, s in zip(self.pieces, spreads, strict=True))
+        whitener = tuple(_whitener(deviation, s, c[0]) for s, c in zip(spreads, counted, strict=True))
         return replace(self, whitener=whitener, instants=instants)
 
 
-def _whitener(count: int, deviation: np.ndarray, spread: np.ndarray | None) -> np.ndarray:
-    """[1, K C] inverse deviations, or of windows with a spread [W, K C, K C] the inverse root of their covariance."""
-    flat = np.repeat(deviation, count)
+def _whitener(deviation: np.ndarray, spread: np.ndarray | None, counted: np.ndarray) -> Whitener:
+    """Of a deviation [C] and the spread [W, K, C, R] of a piece at the instants that count, [W, K, 1] bool.
+
+    What does not count must not tell where a motion began.
+    """
     if spread is None:
-        return 1.0 / flat[None]
-    # In units of the white noise: I + s s', whose inverse root differs from I in the span of s alone.
-    s = np.swapaxes(spread, 1, 2).reshape(len(spread), -1, spread.shape[3]) / flat[:, None]
-    left, size, _ = np.linalg.svd(s, full_matrices=False)
-    shrink = 1.0 / np.sqrt(1.0 + size**2) - 1.0
-    root = np.eye(len(flat)) + np.einsum("wik,wk,wjk->wij", left, shrink, left)
-    return root / flat
+        return Whitener(deviation)
+    s = np.swapaxes(spread * counted[..., None] / deviation[:, None], 1, 2)
+    left, size, _ = np.linalg.svd(s.reshape(len(s), -1, s.shape[3]), full_matrices=False)
+    return Whitener(deviation, left, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
 
 
 def windowed_log(
@@ -208,11 +224,12 @@ def windowed_log(
     space: Space,
     recordings: Sequence[Recording],
     config: CompareConfig,
-    windows: WindowConfig | None,
+    windows: WindowConfig,
     effects: Sequence[Effect] = (),
     fitted_share: float = 1.0,
     grid: float | None = None,
-    lead: float = 0.0,
+    *,
+    whole: bool = False,
 ) -> WindowedLog:
     """The cost of the repeats of commanded recordings over a space.
 
@@ -221,12 +238,11 @@ def windowed_log(
         space: meaning of the vectors [D].
         recordings: of the same channels and columns, each of one repeat or several.
         config: how simulation and measurement are compared.
-        windows: None: motions are replayed whole, as they are where `why_whole` says why.
+        windows: how recordings are cut.
         effects: in the replays.
         fitted_share: of each repeat, whose first windows come before all that is kept as test data.
         grid: s, time steps that windows begin on; None: the scene's.
-        lead: s, at the beginning of motions that are replayed whole, which are not compared: the error of the measured
-            start fades in it.
+        whole: replay motions whole, as they are where `why_whole` says why.
 
     Raises:
         ValueError: what `make_cost` refuses, or no window of which enough was measured.
@@ -236,7 +252,7 @@ def windowed_log(
     check_read(scene, space, effects)
     check_inertia(scene, space)
     reasons = [why_whole(scene, recording) for recording in recordings]
-    why = "motions were asked for whole" if windows is None else next((r for r in reasons if r), "")
+    why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")
     drives = list[Drive]()
     for recording in recordings:
         drive = followed(scene, recording, config)
@@ -246,11 +262,8 @@ def windowed_log(
     pieces = list[Piece]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):
-            of = scene, space, recording, repeat, drive, config
-            if why or windows is None:
-                pieces.append(as_a_whole(*of, effects, steps, lead))
-            else:
-                pieces.append(in_windows(*of, windows, effects, grid))
+            of = scene, space, recording, repeat, drive, config, windows, effects
+            pieces.append(as_a_whole(*of, steps) if why else in_windows(*of, grid))
     pieces = [piece for piece in pieces if piece.count]
     if not pieces:
         raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")
@@ -258,9 +271,9 @@ def windowed_log(
     comparison = _comparison(scene, recordings, pieces, order, config)
     return WindowedLog(
         scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
-        tuple(pieces), order, unit, fitted, why, STRETCH if windows is None or why else windows.length,
+        tuple(pieces), order, unit, fitted, why, STRETCH if why else windows.length,
         np.ones(len(order), bool),
-        lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, lead),
+        lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),
     )  # fmt: skip
 
 

@@ -268,15 +268,13 @@ def windowed_case(
     scene, whole = ready(scene), joined(base, effects)
     share = 1.0 if test else config.blocks.fitted_share
     at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
-    windows = None if at_once else config.windows
-    log = windowed_log(scene, whole, train, config.compare, windows, effects, share, lead=config.windows.lead)
+    compare, windows = config.compare, config.windows
+    log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
     own = per_recording_nuisances(base) if test else []
     judged = None
     if test:
-        judged = windowed_log(
-            scene, unbounded(whole, own), test, config.compare, windows, effects, lead=config.windows.lead
-        )
+        judged = windowed_log(scene, unbounded(whole, own), test, compare, windows, effects, whole=at_once)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
     first = _first_values(log, base, effects, end, rough)
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
@@ -293,7 +291,7 @@ def windowed_case(
         everything = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
         sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
     last = sets[2] if len(sets) > PARTS else None
-    limits = ([f"Motions were replayed whole: {log.whole}."] if windows and log.whole else []) + list(plan.limits)
+    limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
 
 

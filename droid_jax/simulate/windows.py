@@ -22,6 +22,7 @@ from droid_jax.simulate.servo_gains import servo_factors
 
 ORDER = 3  # of the polynomial through measured positions
 SAMPLES = 7  # that it goes through at least
+ONE_SIDED = 2.0  # times the reach, where nothing was measured before the beginning
 WIDER = 1.6  # times its reach, for a second one: what both differ by is the error of its form
 
 
@@ -144,25 +145,65 @@ def cut(
     return Windows(begin, table, gains, start, speed, spread, earlier, steps).kept(known)
 
 
+def start_spread(
+    scene: Scene, recording: Recording, qpos0: np.ndarray, repeat: int, timestep: float, config: WindowConfig
+) -> np.ndarray:
+    """[2 nv, 2 nv] how far the start at rest of a motion that is replayed whole may be off, as `Windows.spread`.
+
+    The state is that of a cubic through the first measured positions.  What the start differs from it by counts as a
+    deviation beside its noise, so that a log that begins in motion has a wide one.  Zero of joints that were not
+    measured, or too seldom.
+
+    Args:
+        scene: the robot.
+        recording: with the positions, if they were measured.
+        qpos0: [nq] where the replay starts, at rest.
+        repeat: of the recording.
+        timestep: s, of the replay.
+        config: how far its measured positions reach.
+    """
+    size = scene.model.nv
+    found = np.zeros((2 * size, 2 * size))
+    if "position" not in recording.channels or size != scene.model.nq:
+        return found
+    channel = recording.channels["position"]
+    reach, begin = ONE_SIDED * reach_of(channel, config), np.array([float(recording.time[0])])
+    for joint in set(scene.single_joints) & set(channel.columns):
+        column = channel.columns.index(joint)
+        (state,), (root,) = joint_states(channel, repeat, column, begin, reach, 0.5 * timestep, one_sided=True)
+        if np.isfinite(state).all():
+            off = state - [qpos0[scene.qpos(joint)], 0.0]
+            pair = np.array([scene.dof(joint), size + scene.dof(joint)])
+            found[pair[:, None], pair] = np.linalg.cholesky(root @ root.T + np.diag(off**2))
+    return found
+
+
 def reach_of(channel: Channel, config: WindowConfig) -> float:
     """s, to both sides, that hold enough samples of a channel for the state where a window begins."""
     return max(config.reach, 0.5 * SAMPLES * float(np.median(np.diff(channel.time))))
 
 
 def joint_states(
-    channel: Channel, repeat: int, column: int, at: np.ndarray, reach: float, early: float = 0.0
+    channel: Channel,
+    repeat: int,
+    column: int,
+    at: np.ndarray,
+    reach: float,
+    early: float = 0.0,
+    *,
+    one_sided: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Position and speed [W, 2] of a joint at W instants [s], and a square root [W, 2, 2] of their covariance.
 
     early: s, by which the speed is that of an earlier instant: a replay's lie half a step before its positions.
+    one_sided: nothing was measured before these instants.
 
     A cubic through the samples within `reach`; its covariance is that of the samples' noise (of all instants, or of
     this one's where it is larger) and of the difference to a wider one.  NaN where too little was measured.
     """
     seen = channel.mask[repeat, :, column]
     time, values = channel.time[seen], channel.values[repeat, seen, column].astype(float)
-    narrow = [_cubic(time, values, t, reach, early) for t in at]
-    wide = [_cubic(time, values, t, WIDER * reach, early) for t in at]
+    narrow, wide = ([_cubic(time, values, t, r, early, one_sided) for t in at] for r in (reach, WIDER * reach))
     variances = [fit[2] for fit in narrow if fit is not None]
     usual = float(np.mean(variances)) if variances else 0.0
     state, root = np.full((len(at), 2), np.nan), np.zeros((len(at), 2, 2))
@@ -176,12 +217,13 @@ def joint_states(
 
 
 def _cubic(
-    time: np.ndarray, values: np.ndarray, at: float, reach: float, early: float
+    time: np.ndarray, values: np.ndarray, at: float, reach: float, early: float, one_sided: bool
 ) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Position and speed [2] at an instant, their covariance [2, 2] for noise of one, and the noise's variance."""
     inside = np.abs(time - at) <= reach + 1e-9
     x = (time[inside] - at) / reach
-    if len(x) <= ORDER + 1 or not (np.min(x, initial=1.0) < -0.3 and np.max(x, initial=-1.0) > 0.3):
+    before = one_sided or np.min(x, initial=1.0) < -0.3
+    if len(x) <= ORDER + 1 or not (before and np.max(x, initial=-1.0) > 0.3):
         return None
     order = np.arange(ORDER + 1)
     powers = x[:, None] ** order

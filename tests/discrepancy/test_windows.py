@@ -104,6 +104,11 @@ def log_of(space: Space, recordings: list[Recording], **changes: Any) -> Windowe
     return windowed_log(scene(), space, recordings, config, SHORT, **changes)
 
 
+def whole_log(space: Space, recordings: list[Recording], **changes: Any) -> WindowedLog:
+    config, windows = CompareConfig(channels={"position": 1.0}), WindowConfig(lead=0.0)
+    return windowed_log(scene(), space, recordings, config, windows, whole=True, **changes)
+
+
 def test_windows_leave_noise_at_the_truth(space: Space):
     """Whatever the gain of a recording; what the spread of their first states does is in the noise."""
     log = log_of(space, [swung("a", 1.0, 0.7, noise=NOISE), swung("soft", 0.6, 1.1, noise=NOISE)], fitted_share=0.7)
@@ -126,14 +131,13 @@ def test_windows_leave_noise_at_the_truth(space: Space):
 @pytest.mark.slow
 def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
     """Which make blocks, as windows do."""
-    config = CompareConfig(channels={"position": 1.0})
-    log = windowed_log(scene(), space, [swung("a", 1.0, 0.7, noise=NOISE)], config, None, fitted_share=0.5)
+    log = whole_log(space, [swung("a", 1.0, 0.7, noise=NOISE)], fitted_share=0.5)
     assert log.whole and log.unit.max() + 1 == 3 and log.fitted == 2 and log.unit_seconds == 0.5
     left = log.residual(space.values(TRUE))
     assert np.sqrt(np.mean(left**2)) < 2 * NOISE
-    white = log.about(space.mean).with_noise(np.full(1, NOISE), log.unit < 2).whitened(space.values(TRUE)[None])[0]
+    white = log.with_noise(np.full(1, NOISE), log.unit < 2).whitened(space.values(TRUE)[None])[0]
     np.testing.assert_allclose(white, np.where(log.unit < 2, -left[:, 0] / NOISE, 0.0), atol=1e-3)
-    again = windowed_log(scene(), space, [with_a_gap()], config, None, fitted_share=0.5)
+    again = whole_log(space, [with_a_gap()], fitted_share=0.5)
     instants = [set(np.round(of.pieces[0].at.ravel(), 6)) for of in (again, log)]
     assert instants[0] < instants[1] and len(instants[0]) > 0.5 * len(instants[1])
     assert np.sqrt(np.mean(again.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
@@ -144,10 +148,10 @@ def test_motions_of_about_one_length_are_replayed_together(space: Space):
     assert shared_steps([400, 100, 380, 390]) == [400, 100, 400, 400] and shared_steps([7]) == [7]
     logs = [swung("a", 1.0, 0.7), swung("soft", 0.6, 1.1)]
     logs[1] = logs[1].window(0.0, 0.9 * logs[1].duration)
-    config, rows = CompareConfig(channels={"position": 1.0}), np.stack([space.mean, space.values(TRUE)])
-    both = windowed_log(scene(), space, logs, config, None)
+    rows = np.stack([space.mean, space.values(TRUE)])
+    both = whole_log(space, logs)
     assert both.pieces[0].program is both.pieces[1].program
-    alone = [windowed_log(scene(), space, [log], config, None).simulated(rows) for log in logs]
+    alone = [whole_log(space, [log]).simulated(rows) for log in logs]
     np.testing.assert_allclose(both.simulated(rows), np.concatenate(alone, axis=1), atol=1e-5)
 
 
@@ -168,11 +172,29 @@ def test_a_masked_stretch_leaves_its_windows_out(space: Space):
 def test_the_noise_of_a_window_holds_the_spread_of_its_state():
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(3, 5, 2, 4))  # windows, instants, columns, directions
-    deviation = np.array([0.3, 2.0])
-    for matrix, s in zip(_whitener(5, deviation, spread), spread, strict=True):
-        flat = np.swapaxes(s, 0, 1).reshape(10, 4)
-        covariance = np.diag(np.repeat(deviation, 5) ** 2) + flat @ flat.T
+    deviation, counted = np.array([0.3, 2.0]), np.ones((3, 5, 1), bool)
+    counted[2, 3:] = False
+    each = np.broadcast_to(np.eye(10).reshape(10, 1, 5, 2), (10, 3, 5, 2))  # one residual after the other
+    matrices = _whitener(deviation, spread, counted)(each).reshape(10, 3, 10)
+    for matrix, s in zip(np.moveaxis(matrices, 0, 2), spread * counted[..., None], strict=True):
+        covariance = np.diag(np.tile(deviation, 5) ** 2) + s.reshape(10, 4) @ s.reshape(10, 4).T
         np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(10), atol=1e-9)
+
+
+def test_a_motion_that_is_replayed_whole_may_begin_elsewhere(space: Space):
+    """What a wrong start leaves is in the noise, and is told by the instants that count alone."""
+    truth, right = space.values(TRUE), swung("a", 1.0, 0.7, noise=NOISE)
+    off = replace(right, qpos0={joint: start + 20 * NOISE for joint, start in right.measured_start().items()})
+    log, noise = whole_log(space, [off]).about(truth), np.full(1, NOISE)
+    half = log.unit < 2
+    without = replace(log, spreads=())
+    plain, aware = (of.with_noise(noise, half).whitened(truth[None])[0][half] for of in (without, log))
+    assert np.mean(plain**2) > 3.0 and np.mean(aware**2) < 1.0
+    later = log.measured + np.where(half, 0.0, 1.0)[:, None]
+    (channel,) = log.comparisons[0].channels
+    moved = replace(channel, noise=replace(channel.noise, mean=later))
+    other = replace(log, comparisons=(replace(log.comparisons[0], channels=(moved,)),))
+    np.testing.assert_allclose(other.with_noise(noise, half).whitened(truth[None])[0][half], aware, atol=1e-9)
 
 
 def test_what_acts_on_torque_sensors_alone_is_not_asked_about_in_positions():
