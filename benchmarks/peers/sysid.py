@@ -21,6 +21,7 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_engine import instrument
 from droid_jax.simulate.replay import make_drive
+from droid_jax.simulate.servo_gains import scale_gains, servo_factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,39 +71,48 @@ def fit(
     space: Space,
     recordings: Sequence[Recording],
     *,
+    channel: str = "torque",
     off_bounds: bool = False,
     priors: bool = False,
     **options: Any,
 ) -> PeerFit:
-    """Fit all of `space`, from its means and within its bounds, to the mean torques of recordings with commands.
+    """Fit all of `space`, from its means and within its bounds, to the mean of recordings with commands.
 
+    channel: "torque" or "position"; each recording has the servo gains that it states.
     off_bounds: move what starts near a bound inwards, as its own warning advises.
     priors: of the nuisances, as rows of the residual (`with_priors`).
     options: of its optimiser (max_iters, x_scale, optimizer, ...).
     """
-    sysid = library()
     plain = replace(scene, model=instrument(scene))
-    groups = []
-    for recording in recordings:
-        drive = make_drive(scene, recording)
-        state = sysid.create_initial_state(plain.model, drive.qpos0)
-        control = sysid.TimeSeries(drive.time, drive.command)
-        measured = _measured(recording)
-        groups.append(
-            sysid.ModelSequences(
-                recording.name, scene.spec, "repeats", state, control, measured, allow_missing_sensors=True
-            )
-        )
-    residual = sysid.build_residual_fn(
-        models_sequences=groups,
-        build_model=lambda parameters, spec: make_c_model(plain, space, parameters.as_vector()),
-        modify_residual=_difference(plain, space),
-        resample_true=False,
-    )
+    each = [_residual(plain, space, recording, channel) for recording in recordings]
+
+    def residual(x: np.ndarray, parameters: Any, **more: Any) -> Any:
+        found = [one(x, parameters, **more) for one in each]
+        return tuple([part for parts in kind for part in parts] for kind in zip(*found, strict=True))
+
     if priors:
         residual = with_priors(residual, space, float(np.mean([_noise(r) for r in recordings])))
     parameters = parameters_of(space)
     return minimise(parameters.move_off_bounds() if off_bounds else parameters, residual, **options)
+
+
+def _residual(plain: Scene, space: Space, recording: Recording, channel: str) -> Callable[..., Any]:
+    """Its residual function of one recording; plain: the scene with its sensors."""
+    sysid = library()
+    drive = make_drive(plain, recording)
+    factors = servo_factors(plain, drive)
+    state = sysid.create_initial_state(plain.model, drive.qpos0)
+    control = sysid.TimeSeries(drive.time, drive.command)
+    measured = _measured(recording, channel)
+    sequences = sysid.ModelSequences(
+        recording.name, plain.spec, "repeats", state, control, measured, allow_missing_sensors=True
+    )
+    return sysid.build_residual_fn(
+        models_sequences=[sequences],
+        build_model=lambda parameters, spec: scale_gains(make_c_model(plain, space, parameters.as_vector()), factors),
+        modify_residual=_difference(plain, space, channel),
+        resample_true=False,
+    )
 
 
 def parameters_of(space: Space, modifier: Callable[[Parameter], Callable[..., None]] | None = None) -> Any:
@@ -144,30 +154,31 @@ def _noise(recording: Recording) -> float:
     return float(np.sqrt(np.nanmean((scatter / (np.linalg.norm(mean, axis=0) / np.sqrt(2))) ** 2)))
 
 
-def _measured(recording: Recording) -> Any:
-    """Its time series of the repeats' mean torque."""
+def _measured(recording: Recording, name: str) -> Any:
+    """Its time series of a channel's mean over the repeats."""
     sysid = library()
-    channel = recording.channel("torque")
-    mean = np.nanmean(_torques(recording), axis=0)
+    channel = recording.channel(name)
+    mean = np.nanmean(np.where(channel.mask, channel.values, np.nan), axis=0)
     names = {name: (sysid.SignalType.CustomObs, np.array([i])) for i, name in enumerate(channel.columns)}
     return sysid.TimeSeries(channel.time - recording.time[0], mean, signal_mapping=names)
 
 
-def _difference(scene: Scene, space: Space) -> Any:
+def _difference(scene: Scene, space: Space, channel: str) -> Any:
     """Its residual of one rollout: offsets in time and torque applied, at the times of the measurement.
 
     Rows of sensors belong to the state before a step, its clock to the state after it.
     """
     sysid = library()
     joints = len(scene.joints)
-    offsets = [space.names.index(n) if n in space.names else None for n in _offsets(scene)]
+    first = joints if channel == "position" else 0  # column of the sensors: torques, then positions
+    offsets = [space.names.index(n) if n in space.names and not first else None for n in _offsets(scene)]
     late = space.names.index("time_offset") if "time_offset" in space.names else None
 
     def modify(parameters, predicted, measured, model, return_pred_all, state=None, sensor_weights=None):
         x = parameters.as_vector()
         at = measured.times - (0.0 if late is None else x[late])
         clock = predicted.times - model.opt.timestep
-        values = interpolate(at, clock, predicted.data[:, :joints])
+        values = interpolate(at, clock, predicted.data[:, first : first + joints])
         values += [0.0 if i is None else x[i] for i in offsets]
         trace = sysid.TimeSeries(measured.times, values, measured.signal_mapping)
         error = sysid.weighted_diff(predicted_data=values, measured_data=measured.data, model=model)

@@ -1,1 +1,0 @@
-"""Other programs that identify parameters, each behind one function, for benchmarks/peer_*.py."""
