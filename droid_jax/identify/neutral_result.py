@@ -23,7 +23,9 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.mjcf import FittedFiles, field_unit, fitted_files, is_angle, mjcf_attribute, native, unwritten
 from droid_jax.model.parameters import Parameter, Role, Space
-from droid_jax.model.physics import make_c_model
+from droid_jax.model.physics import entries_written, make_c_model
+from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
+from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, root_of
 from droid_jax.model.scene import Scene
 from droid_jax.storage import write_bytes, write_text
 
@@ -111,9 +113,12 @@ def neutral_json(
     priors = dict(zip(space.names, np.stack(prior(space).interval(0.9), axis=1).tolist(), strict=True))
     rows = _rows(scene, space, effects, np.asarray(values), made)
     drawn = [dict(zip(space.names, row, strict=True)) for row in gaussian.sample(0, DRAWS).tolist()]
+    inertias = _inertias(scene, space)
     for row in rows:
         row |= {"value": apply_fit.number_of(row, named), "interval": _interval(row, intervals, drawn)}
         row["prior"] = _interval(row, priors, [])
+    for inertia in inertias:
+        _weigh(rows, inertia, named, drawn)
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
     laws = [e for e in effects if e.command or e.servo or e.force or e.frictionloss]
     fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
@@ -135,6 +140,7 @@ def neutral_json(
         },
         "parameters": [_parameter(p, named[p.name], intervals[p.name]) for p in space.parameters],
         "table": [{k: v for k, v in row.items() if k != "own"} for row in rows],
+        "inertias": inertias,
         "laws": [_law(law) for law in tables if isinstance(law, LawTable)],
         "drives": _drives(scene, make_c_model(scene, space, np.asarray(values))),
         "not_in_mjcf": _lacking(scene, space, effects, tables),
@@ -175,7 +181,7 @@ def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
 def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:
     """The mjx.Model with the numbers that parameters write; what MuJoCo derives from them is the scene's."""
     model = make_c_model(scene, space, values)
-    fields = {w.field for p in space.parameters for w in p.writes}
+    fields = {field for field, _ in entries_written(space)}
     return scene.mjx.replace(**{f: np.asarray(getattr(model, f), np.float32) for f in sorted(fields)})
 
 
@@ -200,6 +206,10 @@ def _rows(
     writes: dict[tuple[str, tuple[int, ...]], list[dict[str, Any]]] = {}
     for p in space.parameters:
         for w in p.writes:
+            if w.field == PSEUDO_INERTIA:
+                own = [(f, k) for f in WEIGHTS for k in np.ndindex(getattr(scene.model, f)[w.index[0]].shape)]
+                writes.update({(f, (w.index[0], *k)): [] for f, k in own})
+                continue
             one = {"parameter": p.name, "mode": w.mode.value, "gain": w.gain, "offset": w.offset}
             writes.setdefault((w.field, w.index), []).append(one)
     model = make_c_model(scene, space, values)
@@ -208,6 +218,40 @@ def _rows(
             writes.setdefault((field, (int(row),)), [])
     said = {(c.field, c.entry): (c.attribute, c.index) for c in (made.changes if made else ())}
     return [_row(scene, field, index, of, said) for (field, index), of in writes.items()]
+
+
+def _inertias(scene: Scene, space: Space) -> list[dict[str, Any]]:
+    """Bodies whose whole inertia is a parameter: the root of their pseudo-inertia, and what sets its ten terms."""
+    found = dict[int, list[dict[str, Any] | None]]()
+    for p in space.parameters:
+        for w in p.writes:
+            if w.field == PSEUDO_INERTIA:
+                terms = found.setdefault(w.index[0], [None] * len(TERMS))
+                terms[w.index[1]] = {"parameter": p.name, "gain": w.gain, "offset": w.offset}
+    return [
+        {
+            "name": scene.model.body(body).name,
+            "id": body,
+            "root": root_of(*(np.asarray(getattr(scene.model, f)[body], float) for f in WEIGHTS)).tolist(),
+            "terms": terms,
+        }
+        for body, terms in found.items()
+    ]
+
+
+def _weigh(
+    rows: Sequence[dict[str, Any]], inertia: dict[str, Any], values: dict[str, float], drawn: list[dict[str, float]]
+) -> None:
+    """Values and intervals of the rows of a body whose whole inertia is a parameter, by its draws."""
+    best, draws = (
+        apply_fit.inertia_of(inertia, values),
+        [apply_fit.inertia_of(inertia, each) for each in drawn],
+    )
+    for row in rows:
+        if row["field"] in WEIGHTS and row["own"][0] == inertia["id"]:
+            at = row["own"][1:]
+            row["value"] = float(best[row["field"]][at])
+            row["interval"] = np.quantile([d[row["field"]][at] for d in draws], [0.05, 0.95]).tolist()
 
 
 def _row(

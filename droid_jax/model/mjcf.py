@@ -18,6 +18,7 @@ from droid_jax.model.fields import check_space
 from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumber, WantedNumber, edit
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
+from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
 from droid_jax.model.scene import Scene
 from droid_jax.model.visual_geoms import compiled, keep_inertia, look_geoms, weigh
 
@@ -58,7 +59,7 @@ _UNITS = {  # of fields by hinge and slide, where they are not the same
     "body_pos": "m", "body_ipos": "m", "geom_pos": "m", "geom_size": "m", "geom_margin": "m", "geom_gap": "m",
     "jnt_pos": "m", "pair_margin": "m", "pair_gap": "m",
 }  # fmt: skip
-WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING})  # model fields that MJCF can say
+WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING, PSEUDO_INERTIA})  # model fields that MJCF can say
 _ANGLES = {"jnt_range", "qpos_spring", "qpos0"}  # written in the compiler's unit
 _PLACE = {"body_pos", "body_quat"}  # written together
 # Compared with the model once more, a compiler may know more ways to work numbers out.

@@ -27,13 +27,17 @@ A factor on a number of the DC motor of a joint's servo: stall_torque, no_load_s
     {"field": "dof_armature", "element": ["shoulder", "elbow"], "name": "rotor", "std": 0.01, "high": 0.2}
 
 A list of elements (of joints, for "servo" and "motor") or of columns makes one parameter that they share.
+
+    {"inertia": "forearm", "std": 0.1}
+
+The whole inertia of a body, ten parameters that are a possible body at every value (model/pseudo_inertia.py).
 """
 
 from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -54,10 +58,13 @@ from droid_jax.model.fields import (
 )
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
+from droid_jax.model.pseudo_inertia import check_alone, inertia_parameters
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
-_KINDS = ("field", "sensor", "servo", "motor")
+_KINDS = ("field", "sensor", "servo", "motor")  # of entries of one parameter
+_INERTIA = "inertia"
+_OF_INERTIA = (_INERTIA, "std", "high", "nuisance", "group")
 _NEEDED = ("element", "std", "high")
 _TIME = Role.TIME_OFFSET.value
 SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
@@ -70,6 +77,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     sensor: str | msgspec.UnsetType = msgspec.UNSET
     servo: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     motor: str | msgspec.UnsetType = msgspec.UNSET
+    inertia: str | msgspec.UnsetType = msgspec.UNSET
     element: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     name: str | msgspec.UnsetType = msgspec.UNSET
     unit: str | msgspec.UnsetType = msgspec.UNSET
@@ -97,7 +105,7 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
         scene: whose elements the entries name.
 
     Returns:
-        A space of one parameter for each entry, in the file's order.
+        A space of one parameter for each entry, of ten for each inertia, in the file's order.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -105,11 +113,15 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
     """
     entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
     instance(scene, "scene", Scene)
-    parameters = [_parameter(scene, entry, f"{path}, entry {i}") for i, entry in enumerate(entries, 1)]
-    for i, p in enumerate(parameters, 1):
+    parameters = [(i, p) for i, entry in enumerate(entries, 1) for p in _parameters(scene, entry, f"{path}, entry {i}")]
+    for i, p in parameters:
         if first.setdefault(p.name, i) != i:
             raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
-    space = Space(tuple(parameters))
+    space = Space(tuple(p for _, p in parameters))
+    try:
+        check_alone(space)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     for p in space.parameters:
         if p.scaling is Scaling.LOG and p.mean + p.log_offset < SMALL * p.std:
             warnings.warn(
@@ -137,13 +149,14 @@ def _entries(path: Path) -> list[Any]:
     return cast(list[Any], content)
 
 
-def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
+def _parameters(scene: Scene, given: Any, where: str) -> Sequence[Parameter]:
+    """Those of an entry."""
     if not isinstance(given, dict):
         raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
     entry = cast(dict[str, Any], given)
     missing = [k for k in _needed(entry) if k not in entry]
-    if sum(kind in entry for kind in _KINDS) != 1:
-        missing.insert(0, "one of field, sensor, servo and motor")
+    if sum(kind in entry for kind in (*_KINDS, _INERTIA)) != 1:
+        missing.insert(0, "one of field, sensor, servo, motor and inertia")
     unknown = [k for k in entry if k not in _KNOWN]
     if wrong := faults({"missing": missing, "unknown": unknown}):
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
@@ -152,15 +165,17 @@ def _parameter(scene: Scene, given: Any, where: str) -> Parameter:
     read = msgspec.structs.asdict(typed(entry, _Entry, where))
     options: dict[str, Any] = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
+        if _INERTIA in options:
+            return inertia_parameters(scene, options.pop(_INERTIA), **options)
         if isinstance(options.get("element", options.get("servo")), list) or isinstance(options.get("column"), list):
-            return _shared(scene, options)
-        return _single(scene, options)
+            return [_shared(scene, options)]
+        return [_single(scene, options)]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 
 def _needed(entry: Mapping[str, Any]) -> tuple[str, ...]:
-    if "servo" in entry:
+    if "servo" in entry or _INERTIA in entry:
         return ("std",)
     if "motor" in entry:
         return ("element", "std")
@@ -217,6 +232,8 @@ def _check_measured(scene: Scene, joint: str) -> None:
 
 def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
+    if _INERTIA in entry:
+        return tuple(key for key in _KNOWN if key not in (*_KINDS, *_OF_INERTIA))
     if "servo" in entry:
         return ("element", "column", "mode")
     if "motor" in entry:

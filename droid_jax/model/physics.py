@@ -20,6 +20,8 @@ import numpy as np
 
 from droid_jax.model.mjx_internals import array_fields, quat_multiply, tendon_jacobian
 from droid_jax.model.parameters import Space, Write
+from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
+from droid_jax.model.pseudo_inertia import as_written, check_alone, nominal, weights
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
@@ -66,14 +68,21 @@ def model_writes(space: Space) -> tuple[tuple[int, Write], ...]:
 
 def written_fields(space: Space) -> tuple[str, ...]:
     """Names of the model fields that applying a vector changes, derived ones included."""
-    fields = dict.fromkeys(w.field for _, w in model_writes(space))
+    fields = dict.fromkeys(field for field, _ in entries_written(space))
     if _SOURCES & set(fields):
         fields.update(dict.fromkeys(DERIVED))
     return tuple(fields)
 
 
+def entries_written(space: Space) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """(field, index) of MuJoCo's own fields that parameters set; index of a row where all of it is set together."""
+    return as_written(tuple((w.field, w.index) for _, w in model_writes(space)))
+
+
 def check_field(scene: Scene, field: str) -> None:
     """Raise ValueError for a field of the C model that MJX does not have, takes as fixed, or does not read here."""
+    if field == PSEUDO_INERTIA:
+        return
     if field not in _varied_fields() or np.asarray(getattr(scene.model, field)).dtype.kind != "f":
         raise ValueError(f"{field!r} cannot be a parameter: MJX does not simulate it, or takes it as fixed")
     if field == "body_gravcomp" and not scene.model.body_gravcomp.any():
@@ -101,16 +110,23 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
     changed = {}
     for field, writes in by_field.items():
         check_field(scene, field)
-        nominal = jnp.asarray(getattr(model, field))
+        own = jnp.asarray(nominal(model, field), jnp.float32 if field == PSEUDO_INERTIA else None)
         new: dict[tuple[int, ...], jax.Array] = {}
         for column, w in writes:  # several parameters of one entry act one after the other
-            new[w.index] = w.new(new.get(w.index, nominal[w.index]), values[column])
+            new[w.index] = w.new(new.get(w.index, own[w.index]), values[column])
         index = tuple(np.array(axis) for axis in zip(*new, strict=True))
-        changed[field] = nominal.at[index].set(jnp.stack(list(new.values())).astype(nominal.dtype))
+        changed[field] = own.at[index].set(jnp.stack(list(new.values())).astype(own.dtype))
+    if PSEUDO_INERTIA in changed:
+        terms = changed.pop(PSEUDO_INERTIA)
+        check_alone(space)
+        for body in dict.fromkeys(w.index[0] for _, w in by_field[PSEUDO_INERTIA]):
+            for field, number in weights(scene.model, body, terms[body], jnp).items():
+                own = changed.get(field, jnp.asarray(getattr(model, field)))
+                changed[field] = own.at[body].set(number.astype(own.dtype))
     for field in set(UNIT) & set(changed):
         changed[field] /= jnp.linalg.norm(changed[field], axis=1, keepdims=True)
     model = model.replace(**changed)
-    if _SOURCES & set(by_field):
+    if _SOURCES & set(changed):
         model = derive(model)
     return Physics(model, theta_of(space, values))
 
@@ -229,10 +245,17 @@ def _dof_average(model: Any) -> np.ndarray:
 def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
     """The C twin: a copy of the scene's MjModel with the values [D] applied and constants derived."""
     model = copy.copy(scene.model)
+    terms = nominal(model, PSEUDO_INERTIA)
     for column, write in model_writes(space):
-        array = getattr(model, write.field)
+        array = terms if write.field == PSEUDO_INERTIA else getattr(model, write.field)
         array[write.index] = write.new(array[write.index], float(values[column]))
-    written = {w.field for _, w in model_writes(space)}
+    check_alone(space)
+    for body in {w.index[0] for _, w in model_writes(space) if w.field == PSEUDO_INERTIA}:
+        for field, number in weights(scene.model, body, terms[body]).items():
+            getattr(model, field)[body] = number
+        model.body_sameframe[body] = model.body_simple[body] = 0  # what C would take a short cut by
+        model.dof_simplenum[:] = 0
+    written = {field for field, _ in entries_written(space)}
     for array in (getattr(model, field) for field in written.intersection(UNIT)):
         array /= np.linalg.norm(array, axis=1, keepdims=True)
     if (_SOURCES | _PLACES) & written:

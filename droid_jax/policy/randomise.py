@@ -21,7 +21,7 @@ from droid_jax.model.fields import check_space, element_name
 from droid_jax.model.inertia import possible_draws
 from droid_jax.model.mjx_internals import friction_dofs
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import POSE, UNIT, Physics, joined_bodies, make_physics, model_writes, written_fields
+from droid_jax.model.physics import POSE, UNIT, Physics, entries_written, joined_bodies, make_physics, written_fields
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
@@ -80,8 +80,8 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
             stacklevel=2,
         )
     written = dict[str, list[tuple[int, ...]]]()
-    for _, write in model_writes(gaussian.space):  # of a unit vector all that was scaled with what is written
-        written.setdefault(write.field, []).append(write.index[: 1 if write.field in UNIT else None])
+    for field, index in entries_written(gaussian.space):  # of a unit vector all that was scaled with what is written
+        written.setdefault(field, []).append(index[: 1 if field in UNIT else None])
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
         geoms = _geoms_among(scene, model, fields)
