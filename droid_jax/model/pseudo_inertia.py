@@ -155,4 +155,4 @@ def _quaternion(axes: Any, xp: ModuleType) -> Any:
         xp.stack([d - b, c + g, f + h, 1 - a - e + i]),
     ])  # fmt: skip
     best = ways[xp.argmax(xp.diagonal(ways))]
-    return best / xp.linalg.norm(best)
+    return best / xp.linalg.norm(best) * xp.where(best[0] < 0, -1.0, 1.0)
