@@ -76,7 +76,7 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
     for entry, says in (
         ({"servo": "wrist", "std": 0.05}, "no actuator drives 'wrist'"),
         ({"servo": "elbow"}, "missing std"),
-        ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "missing one of field, sensor, servo, motor and inertia"),
+        ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "one of field, sensor, servo, motor and inertia"),
         ({"sensor": "time_offset", "std": 0.05}, "missing high"),
         ({"sensor": "time_offset", "std": 0.05, "high": 1.0, "name": "lag"}, "leave name out"),
         ({"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5, "name": "dry"}, "leave name out"),
