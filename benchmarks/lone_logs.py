@@ -4,7 +4,8 @@
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
 its torques too, searched by stretches of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
-Hidden effects are 3 and 10 times their minimum effect size.  One small JSON a case under RUNS: the run can be stopped
+Hidden effects are 3 and 10 times their minimum effect size, of the library in general or of what is wrong with a set-up
+(`--hidden setup`).  One small JSON a case under RUNS: the run can be stopped
 and goes on where it was, and the same command started twice shares the cases.
 """
 
@@ -24,7 +25,7 @@ import math  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
 from dataclasses import asdict, dataclass, replace  # noqa: E402
-from typing import Any  # noqa: E402
+from typing import Any, Literal  # noqa: E402
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
@@ -94,6 +95,14 @@ HIDDEN = {
         "joint_elasticity[elbow]", "servo_gains[shoulder]", "command_delay", "encoder_zero[elbow]", "tilted_base",
     ),
 }  # fmt: skip
+SETUP = {  # what is wrong with the set-up, not with the machine; of torques alone what only their sensors show
+    "hinge": ("clock_rate", "inner_profile", "feedforward", "command_delay"),
+    "arm": ("tilted_base", "encoder_zero[elbow]", "clock_rate", "held_thing", "inner_profile[shoulder]",
+            "torque_gain[shoulder]", "crosstalk[elbow]", "mesh_friction[shoulder]"),
+}  # fmt: skip
+OF_SENSORS = ("torque_gain", "crosstalk")
+SETS = {"library": HIDDEN, "setup": SETUP}
+NAMES = {"library": "lone_logs", "setup": "setup_errors"}  # of the results
 CHANNELS = {"positions": ("position",), "torques": ("torque", "position")}
 COMBINATIONS = [(scene, channels) for scene in HIDDEN for channels in CHANNELS]
 
@@ -108,6 +117,8 @@ class Arguments:
     """Cases with nothing hidden of each scene and set of channels."""
     blind: int = 60
     """Cases with something hidden, over all of them."""
+    hidden: Literal["library", "setup"] = "library"
+    """What is hidden: effects of the library in general, or errors of the set-up, whose result is setup_errors.json."""
     only: str = ""
     """Cases whose name begins so; the others are left for another process."""
     windows: float = 0.0
@@ -191,14 +202,20 @@ def plans(arguments: Arguments) -> list[Plan]:
     null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
             for n in range(1 if arguments.quick else arguments.null) for scene, channels in COMBINATIONS]  # fmt: skip
     hidden = list[Plan]()
-    count = 1 if arguments.quick else arguments.blind
-    lists = {key: [(e, f) for e in HIDDEN[key[0]] for f in FACTORS] for key in COMBINATIONS}
+    count, kinds = 1 if arguments.quick else arguments.blind, SETS[arguments.hidden]
+    lists = {
+        (scene, channels): [
+            (e, f) for e in kinds[scene] for f in FACTORS if channels == "torques" or not e.startswith(OF_SENSORS)
+        ]
+        for scene, channels in COMBINATIONS
+    }
     for n in range(count):
         scene, channels = key = COMBINATIONS[n % len(COMBINATIONS)]
         each = lists[key]
         order = np.random.default_rng([arguments.seed, COMBINATIONS.index(key)]).permutation(len(each))
         effect, factor = each[order[(n // len(COMBINATIONS)) % len(each)]]
-        hidden.append(Plan(f"blind-{scene}-{channels}-{n}", scene, channels, effect, factor))
+        kind = "blind" if arguments.hidden == "library" else arguments.hidden
+        hidden.append(Plan(f"{kind}-{scene}-{channels}-{n}", scene, channels, effect, factor))
     some = math.ceil(len(null) / max(len(hidden), 1))
     mixed = [p for n, one in enumerate(hidden) for p in (*null[n * some : (n + 1) * some], one)]
     mixed += null[len(hidden) * some :]
@@ -348,13 +365,17 @@ def main(arguments: Arguments) -> None:
     result = {
         **whole,
         "by": {name: summary(some) for name, some in groups.items() if some},
+        "by_effect": {
+            e: summary(some) for e in sorted({c["effect"] for c in cases if c["effect"]})
+            if (some := [c for c in cases if c["effect"] == e])
+        },
         "by_factor": {f"{f:g}": summary([c for c in cases if c["factor"] == f]) for f in FACTORS},
         "codes": sorted({str(c["code"]) for c in cases}),
         "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows_s": arguments.windows},
         "blind_cases": [{k: c.get(k) for k in ("name", "effect", "factor", "verdict", "effects", "indistinguishable",
                                                "named", "wrong", "p", "ranked")} for c in cases if c["effect"]],
     }  # fmt: skip
-    publish(arguments.out, "lone_logs", arguments.quick, arguments.seed, result, line=whole)
+    publish(arguments.out, NAMES[arguments.hidden], arguments.quick, arguments.seed, result, line=whole)
 
 
 if __name__ == "__main__":
