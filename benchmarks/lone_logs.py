@@ -41,7 +41,7 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
     score_test,
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error, intervals  # noqa: E402
 from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
@@ -222,8 +222,8 @@ def plans(arguments: Arguments) -> list[Plan]:
     return [p for p in mixed if not arguments.quick or p.scene == "hinge"]
 
 
-def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | None]:
-    """One log of a robot that is drawn around the priors."""
+def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | None, dict[str, float]]:
+    """One log of a robot that is drawn around the priors, what is hidden in it, and its true parameters."""
     rng, base = np.random.default_rng(seed), bench.base
     values = rng.normal(base.mean, np.where(base.nuisance, 1.0, 0.5) * base.std)
     truth = dict(zip(base.names, np.clip(values, base.low, base.high).tolist(), strict=True))
@@ -241,7 +241,7 @@ def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | 
         trace = simulate(robot.scene, robot.models, robot.qpos0, robot.control[None])
         log = as_recording(robot, trace, sensor_torque(robot, trace), trace.position, name=plan.name)
     kept = {name: log.channels[name] for name in ("position", *bench.channels)}
-    return replace(log, channels=kept).window(HELD, HELD + SECONDS), hidden
+    return replace(log, channels=kept).window(HELD, HELD + SECONDS), hidden, truth
 
 
 def _minimum(bench: Bench, kind: str, joint: str) -> float:
@@ -263,7 +263,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
     began = time.monotonic()
     result: dict[str, Any] = {**asdict(plan), "seed": seed, "code": CODE.get("git")}
     try:
-        log, hidden = recorded(bench, plan, seed)
+        log, hidden, truth = recorded(bench, plan, seed)
         result["recorded"] = time.monotonic() - began
         config = configured(bench.channels, arguments.windows)
         roles = roles_of(Split.WINDOWS, [log])
@@ -281,6 +281,9 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             "ranked": [str(d.candidate.key) for d in _best(screen)],
             "screened": time.monotonic() - began,
         }
+        main = [p.name for p in bench.base.parameters if not p.nuisance]
+        stated = intervals(case.train, model, main)  # 90 %
+        result["held"] = {name: low <= truth[name] <= high for name, (low, high) in stated.items()}
         if not model.refined.converged:
             return {**result, "verdict": "fit not converged", "effects": [], "seconds": time.monotonic() - began}
         if screen.p >= config.selection.significance:  # where the search ends too
@@ -330,6 +333,7 @@ def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "detected": rate(blind, lambda c: c["verdict"] not in silent),
         "named_up_to_tie": rate(blind, lambda c: bool(c.get("named"))),
         "wrong_name_rate": rate(blind, lambda c: bool(c.get("wrong"))),
+        "intervals_hold": rate([{"held": h} for c in null for h in c.get("held", {}).values()], lambda h: h["held"]),
         "p_below": {f"{a:g}": float(np.mean([(c.get("p") or 1.0) < a for c in null])) for a in (0.01, 0.05, 0.1, 0.5)}
         if null
         else {},
