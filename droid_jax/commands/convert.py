@@ -42,7 +42,7 @@ class Convert:
     by its name: droid, robomimic, pace. Default: the map of an earlier log beside --out, or a layout that fits."""
     columns: tuple[str, ...] = ()
     """The same, or changes of the map, as CHANNEL=COLUMN: time, command, position, velocity, torque, object_angle. E.g.
-    position=q{n}, which takes q1, q2, ..., or position=state[0:6]."""
+    position=q{n}, which takes q1, q2, ..., or position=state[0:6]. powered=COLUMN: 0 where the motors are off."""
     units: tuple[str, ...] = ()
     """The same: units of those columns as KIND=UNIT, e.g. angle=deg time=ms torque=mA length=mm force=N."""
     episodes: tuple[str, ...] = ()

@@ -77,6 +77,8 @@ class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, 
     joints: measured joints, named as in the MJCF.  slides: those of them that slide.
     time: the stamps; without them `rate` is that of the rows.
     command, position, velocity, torque, object_angle: columns of each; a name stands for a whole `ChannelMap`.
+    powered: a column that is 0 (or false) where the motors are off, of the file that holds the command: the longest
+        stretch in which they are on is read.
     side, gravity: of the torque, as in a recording.
     stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad.
     rate: Hz; with a column of time, of the common clock that everything is interpolated onto.
@@ -91,6 +93,7 @@ class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, 
     velocity: str | list[str] | ChannelMap | None = None
     torque: str | list[str] | ChannelMap | None = None
     object_angle: str | list[str] | ChannelMap | None = None
+    powered: str | None = None
     side: str | None = None
     gravity: bool | None = None
     stiffness: list[float] = []
@@ -175,8 +178,8 @@ def changed_map(
     """
     where = "--columns"
     content: dict[str, Any] = {} if columns is None else msgspec.to_builtins(columns)
-    if strange := [name for name in channels if name not in (*CHANNELS, "time")]:
-        raise ValueError(f"{where}: {strange[0]!r} is no channel; known are: time, {', '.join(CHANNELS)}")
+    if strange := [name for name in channels if name not in (*CHANNELS, "time", "powered")]:
+        raise ValueError(f"{where}: {strange[0]!r} is no channel; known are: time, {', '.join(CHANNELS)}, powered")
     for name, words in channels.items():
         entry = content.get(name)
         names = [word.strip() for word in _split(words)]

@@ -131,8 +131,38 @@ def _read(opened: Opened, columns: ColumnMap, allow_jitter: bool) -> dict[str, _
                 f"{values[row, column]}; a row without a command has to be filled or cut off"
             )
         found[key] = _Series(time, values)
+    if columns.powered is not None:
+        found = _powered(opened, columns, found)
     begin = found["command"].time[0] if "command" in found else min(series.time[0] for series in found.values())
     return {key: _Series(series.time - begin, series.values) for key, series in found.items()}
+
+
+def _powered(opened: Opened, columns: ColumnMap, found: dict[str, _Series]) -> dict[str, _Series]:
+    """What was recorded in the longest stretch in which the motors are on; a warning says what is left out."""
+    key = "command" if "command" in found else next(iter(found))
+    entry, clock = columns.channel(key), found[key].time
+    assert entry is not None and columns.powered is not None
+    log = opened(entry.file)
+    on = log.numbers(columns.powered)
+    if on.shape != clock.shape:
+        raise ValueError(f"{log.where}, powered: {shown(columns.powered)} must hold one number for each row of {key}")
+    if not (on := np.nan_to_num(on.astype(float)) != 0).any():
+        raise ValueError(f"{log.where}, powered: {shown(columns.powered)} is 0 throughout: the motors are never on")
+    if on.all():
+        return found
+    changes = np.flatnonzero(np.diff(np.r_[False, on, False].astype(int))).reshape(-1, 2)
+    first, end = max(changes.tolist(), key=lambda ends: ends[1] - ends[0])
+    low, high = clock[first], clock[end - 1]
+    warnings.warn(
+        f"{log.where}: the motors are off in {np.mean(~on):.0%} of the rows ({shown(columns.powered)}); read is "
+        f"{low - clock[0]:.3g} to {high - clock[0]:.3g} s, the longest stretch in which they are on",
+        stacklevel=4,
+    )
+    return {
+        name: _Series(series.time[inside], series.values[inside])
+        for name, series in found.items()
+        for inside in ((series.time >= low - SLACK) & (series.time <= high + SLACK),)
+    }
 
 
 def _joints(columns: ColumnMap, key: str) -> list[str]:

@@ -78,6 +78,22 @@ def log(path: Path, separator: str = ",", **changes: np.ndarray) -> Path:
 # Tables
 
 
+def test_what_was_recorded_with_the_motors_off_is_left_out(tmp_path: Path):
+    on = np.ones(len(TIME))
+    on[:20] = on[150:] = 0.0  # 0 to 0.2 s and from 1.5 s on
+    path = log(tmp_path / "a.csv", enabled=on)
+    with pytest.warns(UserWarning, match=r"off in 35% of the rows \('enabled'\); read is 0.2 to 1.49 s"):
+        recording = load_recording(path, columns=whole(powered="enabled"))
+    assert recording.time == pytest.approx(TIME[20:150] - 0.2, abs=1e-6)
+    assert recording.command == pytest.approx(COMMAND[20:150])
+    assert recording.channels["position"].values[0] == pytest.approx(POSITION[20:150])
+    assert len(load_recording(path, columns=whole(powered="state")).time) == len(TIME)
+    assert "'enabled' is 0 throughout: the motors are never on" in refused(
+        log(tmp_path / "b.csv", enabled=0.0 * on), whole(powered="enabled")
+    )
+    assert "no column 'enable'" in refused(path, whole(powered="enable"))
+
+
 pytest.importorskip("polars", reason="tables are read with polars; it comes with the extra 'formats'")
 
 
