@@ -36,6 +36,7 @@ from droid_jax.model.step import gear_torques, simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.runtime import first_device
+from droid_jax.simulate.batching import time_loop
 from droid_jax.simulate.hand_path import solve_pose
 from droid_jax.simulate.replay import (
     apply_forces,
@@ -45,7 +46,6 @@ from droid_jax.simulate.replay import (
     compose,
     servo_input,
 )
-from droid_jax.simulate.time_loop import time_loop
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
 FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyond, the simulation has come apart

@@ -27,10 +27,11 @@ from droid_jax.model.mjx_internals import (
     ConstraintRows,
     at_velocity,
     constraint_rows,
+    exact_segments,
     friction_dofs,
+    midpoint_constraints,
     with_constraint_force,
 )
-from droid_jax.model.patches import exact_segments, midpoint_constraints
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.unsupported_features import check_options
 

@@ -30,6 +30,7 @@ from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.runtime import first_device
+from droid_jax.simulate.batching import time_loop
 from droid_jax.simulate.closed_loops import refuse_floating
 from droid_jax.simulate.initial_state import (
     DEFAULT_START,
@@ -40,7 +41,6 @@ from droid_jax.simulate.initial_state import (
     weight_share,
 )
 from droid_jax.simulate.servo_gains import check_gains, servo_factors, stated_gains, with_gains
-from droid_jax.simulate.time_loop import time_loop
 
 Replay = Callable[[Physics], Rollout]
 TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows
-from droid_jax.model.patches import exact_segments, midpoint_law
+from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows, exact_segments, midpoint_law
 from droid_jax.model.step import simulate_step, solve
 from droid_jax.model.unsupported_features import check_options
 

@@ -18,7 +18,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate import compiled
-from droid_jax.simulate.time_loop import time_loop
+from droid_jax.simulate.batching import time_loop
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from droid_jax.model.mjx_internals import CONSTRAINT_LAW, SEGMENT_POINT
-from droid_jax.model.patches import closest_segment_point, exact_segments, midpoint_constraints
+from droid_jax.model.mjx_internals import (
+    CONSTRAINT_LAW,
+    SEGMENT_POINT,
+    closest_segment_point,
+    exact_segments,
+    midpoint_constraints,
+)
 
 
 def mjx_point(a, b, p):
