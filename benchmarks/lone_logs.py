@@ -41,7 +41,7 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
     score_test,
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error, intervals  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step  # noqa: E402
 from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
@@ -290,7 +290,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             return {**result, "verdict": "none", "effects": [], "seconds": time.monotonic() - began} | _judged(
                 bench, hidden, {"verdict": "none"}
             )
-        step_error = discretisation_error(case.train, model, log)
+        step_error = discretisation_error(case.train, model, with_finer_step(case.train, case.base, log))
         verdict = search_effects(case, model, step_error)
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": time.monotonic() - began}

@@ -63,6 +63,7 @@ def searched(
     board: folder for scalars of the base fit, and of the others that report iterations.
     keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
+    from droid_jax.discrepancy.fitting import with_finer_step
     from droid_jax.discrepancy.missing import amended, search
     from droid_jax.report.progress import scalars, stages
 
@@ -74,7 +75,8 @@ def searched(
         clock = Clock(names, (show, write), checkpoints / "seconds.json")
         clock(names[0], None)
         case = case.with_replay_cache(checkpoints / "replays")
-        verdict = search(split, case, roles, start, clock)
+        fine = with_finer_step(case.train, case.base, roles["train"])
+        verdict = search(split, case, fine, start, clock)
         for now in amended(case, verdict, roles["train"], clock):
             clock.stop()
             keep(case, now, clock.seconds)

@@ -18,11 +18,12 @@ from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.levenberg_marquardt import principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
-from droid_jax.identify.pipeline import Progress, grip_hypotheses, search_cost, starts
+from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
@@ -318,9 +319,7 @@ def _finer(scene: Scene) -> Scene:
     return with_options(scene, timestep=float(scene.model.opt.timestep) / FINER)
 
 
-def discretisation_error(
-    residual_set: ResidualSet, model: FittedModel, recording: Recording, fine: Cost | None = None
-) -> float:
+def discretisation_error(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> float:
     """U0, the U that the simulation's own time step leaves; zero in inverse mode.
 
     The base model is replayed at a quarter of the time step and taken for data.  What the base parameters cannot absorb
@@ -329,14 +328,12 @@ def discretisation_error(
     Args:
         residual_set: of the recording that the model was fitted to.
         model: the base model.
-        recording: the same.
-        fine: what `with_finer_step` made, of this recording or of another with the same commands, to spare a
-            compilation.
+        fine: what `with_finer_step` made of the same recording.
 
     Raises:
         NotReplayed: the finer replay blows up.
     """
-    off = step_difference(residual_set, model, recording, fine)
+    off = step_difference(residual_set, model, fine)
     if off is None:
         return 0.0
     count = residual_set.repeats
@@ -344,22 +341,19 @@ def discretisation_error(
     return float(left @ left / residual_set.resampling.counted.sum())
 
 
-def step_difference(
-    residual_set: ResidualSet, model: FittedModel, recording: Recording, fine: Cost | None = None
-) -> np.ndarray | None:
+def step_difference(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> np.ndarray | None:
     """[M] what a quarter of the time step changes, in one repeat's noise; None in inverse mode.
 
     Arguments and errors as of `discretisation_error`.
     """
-    cost = residual_set.cost
-    fine = with_finer_step(residual_set, model.space, recording) if fine is None else fine.against([recording])
     if fine is None:
         return None
-    values = model.values[cost.space.columns(model.space)]
+    values = model.values[residual_set.cost.space.columns(model.space)]
     coarse = residual_set.whitened(model.values[None])[0]
     off = (fine.whitened(values[None])[0] - coarse).astype(np.float64) / np.sqrt(residual_set.repeats)
     if not np.isfinite(off).all():
-        raise NotReplayed(f"the simulation of {recording.name!r} blows up at a quarter of its time step")
+        name = residual_set.comparison.name
+        raise NotReplayed(f"the simulation of {name!r} blows up at a quarter of its time step")
     return off
 
 

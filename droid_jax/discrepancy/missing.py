@@ -9,7 +9,7 @@ import copy
 import functools
 import itertools
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -28,6 +28,7 @@ from droid_jax.discrepancy.fitting import (
     discretisation_error,
     final_refit,
     final_refit_due,
+    with_finer_step,
 )
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.discrepancy.results import extended
@@ -106,7 +107,8 @@ def find_missing_effects(
     for limit in case.limits:
         warnings.warn(limit, stacklevel=2)
     report = progress or (lambda stage, value: None)
-    verdict = search(split, case, roles, start, report)
+    fine = with_finer_step(case.train, case.base, roles["train"])
+    verdict = search(split, case, fine, start, report)
     *_, whole = amended(case, verdict, roles["train"], report)
     return whole.verdict, extended(case, whole.final)
 
@@ -114,7 +116,7 @@ def find_missing_effects(
 def search(
     split: Split,
     case: Case,
-    roles: Mapping[str, Recording],
+    fine: Cost | None,
     start: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Verdict:
@@ -123,7 +125,7 @@ def search(
     Args:
         split: how the recordings share the work.
         case: with a replay cache (`Case.with_replay_cache`) the search goes on after a stop.
-        roles: role -> recording.
+        fine: what `with_finer_step` made of the training recording.
         start: [F] values of the base parameters from which their fit begins, instead of a search.
         progress: called with a stage's name and its progress value.
     """
@@ -137,7 +139,7 @@ def search(
         else:
             model = base_fit(case.train, case.base, case.config, report, start)
         report("discretisation_error", None)
-        step_error = discretisation_error(case.train, model, roles["train"])
+        step_error = discretisation_error(case.train, model, fine)
     verdict = search_effects(case, model, step_error, report)
     report("verdict", None)
     return verdict

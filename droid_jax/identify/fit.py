@@ -1,18 +1,23 @@
-"""A search under way, `CmaState`, and what it returns: `Fit`, with the history of every restart."""
+"""What a search is given, `search_cost`; a search under way, `CmaState`; what it returns: `Fit`, with the history of
+every restart; and where the refinement begins from there.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.parameters import Parameter, Role, Space
 
 if TYPE_CHECKING:
+    from droid_jax.cost.residuals import CompareConfig
     from droid_jax.identify.checkpoints import Tree
 
+FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 BOUND_SHARE = 0.01  # a best value this close to a bound, as a share of the range in x, counts as on it
 
 
@@ -98,6 +103,21 @@ class SearchProgress:
     sigma: float
     seconds: float
     seconds_left: float
+
+
+def search_cost(
+    cost: Callable[[np.ndarray], Any], config: CompareConfig, full: Space, space: Space, at: np.ndarray | None = None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
+
+    at: [D] where the other parameters stand; default: their means.
+    """
+
+    def searched(rows: np.ndarray) -> np.ndarray:
+        found = np.asarray(cost(full.embed(space, rows, at)), np.float64)
+        return np.where(found == np.float32(config.non_finite_cost), np.inf, found)
+
+    return searched
 
 
 def on_bound(space: Space, best: np.ndarray) -> tuple[str, ...]:
@@ -189,3 +209,25 @@ class CmaState:
         for name, entry in entries.items():
             self.records.setdefault(name, []).append(entry)
         self.records.setdefault("seconds", [])
+
+
+def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
+    """[2 or 3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip, where
+    the space has the friction of one.
+
+    A grip that slips and one that never does are different basins, and neither start finds the other's.
+    """
+    searched = full.embed(space, found.best[None])[0]
+    pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
+    firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
+    return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
+
+
+def grip_hypotheses(space: Space) -> list[dict[str, float]]:
+    """Which fingers slip: each sliding friction alone, and all, at its initial mean.
+
+    Slip is a basin of its own: from a sticking finger no derivative sees it.
+    """
+    sliding = {p.name: p.mean for p in space.of_role(Role.SLIDING_FRICTION)}
+    alone = [{name: mean} for name, mean in sliding.items()]
+    return [*alone, sliding] if len(sliding) > 1 else alone

@@ -17,7 +17,7 @@ from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
-from droid_jax.identify.fit import Fit
+from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.holdout import WORTH, HeldoutDistance, beginning, heldout_distances, split_repeats
 from droid_jax.identify.identifiability import (
@@ -33,7 +33,7 @@ from droid_jax.identify.solution_checks import SolutionCheck, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import possible_draws
-from droid_jax.model.parameters import Role, Space
+from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.recordings.recording import Recording, recordings_of
@@ -142,7 +142,6 @@ class Identified:
 Progress = Callable[[str, Any], None]
 FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
 FEWEST = 16  # samples of a Gaussian that show its spread
-FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
@@ -284,21 +283,6 @@ def prepare(
     )
 
 
-def search_cost(
-    cost: Callable[[np.ndarray], Any], config: CompareConfig, full: Space, space: Space, at: np.ndarray | None = None
-) -> Callable[[np.ndarray], np.ndarray]:
-    """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
-
-    at: [D] where the other parameters stand; default: their means.
-    """
-
-    def searched(rows: np.ndarray) -> np.ndarray:
-        found = np.asarray(cost(full.embed(space, rows, at)), np.float64)
-        return np.where(found == np.float32(config.non_finite_cost), np.inf, found)
-
-    return searched
-
-
 def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
     """The rest of `identify_parameters`: search, refine, calibrate, judge."""
     report = progress or _silent
@@ -418,28 +402,6 @@ def _refined(
     settled = replace(config, basin_hops=0)  # the first one has looked for other basins
     last = run(base, base.first() if whole else early.restated(first.best), first.best, settled)
     return base, replace(last, evaluations=first.evaluations + last.evaluations)
-
-
-def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
-    """[2 or 3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip, where
-    the space has the friction of one.
-
-    A grip that slips and one that never does are different basins, and neither start finds the other's.
-    """
-    searched = full.embed(space, found.best[None])[0]
-    pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
-    firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
-    return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
-
-
-def grip_hypotheses(space: Space) -> list[dict[str, float]]:
-    """Which fingers slip: each sliding friction alone, and all, at its initial mean.
-
-    Slip is a basin of its own: from a sticking finger no derivative sees it.
-    """
-    sliding = {p.name: p.mean for p in space.of_role(Role.SLIDING_FRICTION)}
-    alone = [{name: mean} for name, mean in sliding.items()]
-    return [*alone, sliding] if len(sliding) > 1 else alone
 
 
 def _fingerprint(

@@ -20,6 +20,7 @@ import numpy as np
 from droid_jax.cost.cost import followed
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import with_finer_step
 from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.missing import search
 from droid_jax.errors import reason
@@ -322,7 +323,8 @@ def _rehearse(of: FullRehearsal, case: HiddenCase, replays: Path) -> dict[str, A
     roles = roles_of(split, logs)
     config = replace(of.config, channels=of.channels)
     cased = case_of(split, scene, of.space, effects, roles, config)
-    verdict = search(split, cased.with_replay_cache(replays), roles)
+    fine = with_finer_step(cased.train, cased.base, roles["train"])
+    verdict = search(split, cased.with_replay_cache(replays), fine)
     named = [str(k) for k in verdict.effects]
     ties = [[[str(k) for k in keys] for keys in each] for each in verdict.indistinguishable]
     right = f"{case.effect} at {case.location}"

@@ -64,7 +64,8 @@ class Bench:
         """U0 of a base model; the finer replay is compiled once a scene."""
         if scene not in self.fine:
             self.fine[scene] = with_finer_step(case.train, model.space, recording)
-        return discretisation_error(case.train, model, recording, self.fine[scene])
+        fine = self.fine[scene]
+        return discretisation_error(case.train, model, fine and fine.against([recording]))
 
 
 def _again(known: ResidualSet, recording: Recording) -> ResidualSet:

@@ -24,9 +24,8 @@ def of(found: Small, difference: np.ndarray) -> float:
     """U0 where the finer simulation differs by [M] of the noise of the repeats' mean."""
     case, base = found.case, found.base
     coarse = case.train.whitened(base.values[None])
-    made: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
-    fine: Any = SimpleNamespace(against=lambda recordings: made)
-    return discretisation_error(case.train, base, found.recordings["train"], fine)
+    fine: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
+    return discretisation_error(case.train, base, fine)
 
 
 def test_what_no_base_parameter_can_do_is_the_error(found: Small):
@@ -59,8 +58,9 @@ def test_inverse_dynamics_has_no_time_step(found: Small):
     train = found.case.train
     measured: Any = (object(),)
     inverse = replace(train, cost=replace(train.cost, drives=measured))
-    assert with_finer_step(inverse, found.base.space, found.recordings["train"]) is None
-    assert discretisation_error(inverse, found.base, found.recordings["train"]) == 0.0
+    fine = with_finer_step(inverse, found.base.space, found.recordings["train"])
+    assert fine is None
+    assert discretisation_error(inverse, found.base, fine) == 0.0
 
 
 def test_an_error_of_first_order_may_be_nearly_twice_what_a_quarter_of_the_step_shows():

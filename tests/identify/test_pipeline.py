@@ -20,18 +20,11 @@ from droid_jax.cost.residuals import CompareConfig, make_comparison
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
 from droid_jax.identify import neutral_result, pipeline
-from droid_jax.identify.fit import on_bound
+from droid_jax.identify.fit import grip_hypotheses, on_bound, starts
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.holdout import WORTH, _closed, _floor, _scatter, judged_on, split_repeats
 from droid_jax.identify.multistart import RefineConfig, refine
-from droid_jax.identify.pipeline import (
-    Identified,
-    IdentifyConfig,
-    cost_samples,
-    grip_hypotheses,
-    identify_parameters,
-    starts,
-)
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples, identify_parameters
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Rollout
