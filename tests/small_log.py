@@ -61,11 +61,14 @@ def elbow_space(scene: Scene) -> Space:
     )
 
 
-def elbow_log(coulomb: float, seconds: float = 36.0, repeats: int = 1) -> Recording:
-    """Sines, their torque by hand, and noise that is correlated for a fifth of a second."""
+def elbow_log(coulomb: float, seconds: float = 36.0, repeats: int = 1, pace: float = 1.0) -> Recording:
+    """Sines, their torque by hand, and noise that is correlated for a fifth of a second.
+
+    pace: of the motion; recordings as long as each other share a compiled program.
+    """
     time = np.arange(0.0, seconds, 0.01)
-    phase = 2 * np.pi * np.array([[0.23], [0.51]]) * time
-    size, w = np.array([[0.5], [0.15]]), 2 * np.pi * np.array([[0.23], [0.51]])
+    size, w = np.array([[0.5], [0.15]]), 2 * np.pi * pace * np.array([[0.23], [0.51]])
+    phase = w * time
     q, qd, qdd = (
         (size * np.sin(phase)).sum(0), (size * w * np.cos(phase)).sum(0), -(size * w**2 * np.sin(phase)).sum(0)
     )  # fmt: skip

@@ -33,7 +33,7 @@ COULOMB_KEY = EffectKey("joint_coulomb", "elbow")
 
 LATE = Effect("late", (Parameter("late", "s", 0.0, 0.01, -0.1, 0.1),), command=lambda theta, time, look: look(time),
               locations={"elbow": ("late",)})  # fmt: skip
-THREE = [replace(elbow_log(COULOMB, seconds, 8), name=f"{seconds:g} s") for seconds in (7.0, 6.0, 5.0)]
+THREE = [replace(elbow_log(COULOMB, 7.0, 8, pace), name=f"pace {pace:g}") for pace in (1.0, 0.8, 1.25)]
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,9 @@ def test_a_log_without_commands_has_no_servo_to_ask_about():
 def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 
-    def answer(split, case, roles, start, progress):
-        assert split is Split.RECORDINGS and list(roles) == ["train", "validation", "test"]
+    def answer(split, case, fine, start, progress):
+        assert split is Split.RECORDINGS and list(case.residual_sets) == ["train", "validation", "test"]
+        assert fine is None  # a prescribed motion has no time step
         assert [e.name for e in case.effects] == [e.name for e in observable_effects(scene, THREE)] and len(
             case.effects
         ) > 5

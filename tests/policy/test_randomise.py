@@ -31,7 +31,7 @@ from droid_jax.model.fields import (
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import Physics, make_physics, written_fields
 from droid_jax.model.scene import Scene, compile_scene, load_scene
-from droid_jax.policy.randomise import fixed, of_method, randomised, randomised_model
+from droid_jax.policy.randomise import axes, fixed, of_method, physics_of, randomised, randomised_model
 
 ENVS = 5
 
@@ -52,12 +52,6 @@ def keys():
 
 
 @pytest.fixture(scope="module")
-def drawn(scene, gaussian, keys) -> tuple[Physics, Physics]:
-    """Draws of the door's prior, compiled once, and their axes."""
-    return randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
-
-
-@pytest.fixture(scope="module")
 def bench() -> tuple[Scene, Space]:
     """A small scene whose parameters, of a mass among them, are all in the model."""
     scene, space = small_scene()
@@ -71,11 +65,21 @@ def rows(physics: Physics, batched: Physics, k: int) -> Physics:
     return jax.tree.unflatten(tree, [leaf if axis is None else leaf[k] for leaf, axis in zip(leaves, at, strict=True)])
 
 
-def test_every_row_is_its_draw(scene, gaussian, keys, drawn):
-    physics, batched = drawn
-    seen = np.asarray(physics.model.dof_damping)[:, scene.dof("hinge")]
+@pytest.mark.parametrize(
+    ("of", "joint", "damping"),
+    [("bench", "door", "door_damping"), pytest.param("door", "hinge", "hinge_damping", marks=pytest.mark.slow)],
+)
+def test_every_row_is_its_draw(request: pytest.FixtureRequest, keys, of: str, joint: str, damping: str):
+    """The door's physics compiles for half a minute, in both ways that are compared; the small scene's for seconds."""
+    if of == "bench":
+        scene, space = request.getfixturevalue("bench")
+        gaussian = prior(space)
+    else:
+        scene, gaussian = (request.getfixturevalue(name) for name in ("scene", "gaussian"))
+    physics, batched = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    seen = np.asarray(physics.model.dof_damping)[:, scene.dof(joint)]
     assert len(np.unique(seen)) == ENVS
-    low, high = gaussian.space["hinge_damping"].low, gaussian.space["hinge_damping"].high
+    low, high = gaussian.space[damping].low, gaussian.space[damping].high
     assert np.all((seen >= low) & (seen <= high))
     values = gaussian.sample(np.random.default_rng(np.asarray(jax.random.key_data(keys)).ravel().tolist()), ENVS)
     made = jax.jit(lambda row: make_physics(scene, gaussian.space, row))
@@ -85,14 +89,18 @@ def test_every_row_is_its_draw(scene, gaussian, keys, drawn):
             np.testing.assert_allclose(a, b, rtol=2e-4, atol=1e-5)
 
 
-def test_only_what_is_written_is_batched(scene, gaussian, drawn):
-    physics, batched = drawn
+def test_only_what_is_written_is_batched(scene, gaussian):
+    """On the door, by shape: nothing is compiled for that."""
+    batched = axes(scene, gaussian.space)
+    values = jax.ShapeDtypeStruct((ENVS, len(gaussian.space)), jnp.float32)
+    physics = jax.eval_shape(lambda rows: physics_of(scene, gaussian.space, rows), values)
     varied = {f for f in ("dof_damping", "body_mass", "pair_friction", "geom_size", "jnt_range", "qpos0", "body_pos")
               if getattr(batched.model, f, None) is not None}  # fmt: skip
     assert varied == set(written_fields(gaussian.space)) & {
         "dof_damping", "body_mass", "pair_friction", "geom_size", "jnt_range", "qpos0", "body_pos"
     }  # fmt: skip
     assert physics.model.qpos0.shape == scene.mjx.qpos0.shape
+    assert physics.model.dof_damping.shape == (ENVS, *scene.mjx.dof_damping.shape)
 
 
 @pytest.mark.slow
