@@ -23,7 +23,7 @@ import numpy as np
 from droid_jax.model.actuators import drives_joint, has_servo_damping
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
 from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
-from droid_jax.model.pseudo_inertia import check_alone, nominal
+from droid_jax.model.pseudo_inertia import check_single_inertia, nominal_field
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 _KIND = {
@@ -79,11 +79,11 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
 
 def check_space(scene: Scene, space: Space) -> None:
     """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
-    check_alone(space)
+    check_single_inertia(space)
     for p in space.parameters:
         for w in p.writes:
             known = w.field == PSEUDO_INERTIA or hasattr(scene.model, w.field)
-            array = nominal(scene.model, w.field) if known else None
+            array = nominal_field(scene.model, w.field) if known else None
             if not isinstance(array, np.ndarray):
                 raise ValueError(
                     f"parameter {p.name!r} writes {w.field}, which the model of {scene.name!r} does not have"

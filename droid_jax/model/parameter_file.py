@@ -58,7 +58,7 @@ from droid_jax.model.fields import (
 )
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
-from droid_jax.model.pseudo_inertia import check_alone, inertia_parameters
+from droid_jax.model.pseudo_inertia import check_single_inertia, inertia_parameters
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
@@ -119,7 +119,7 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
             raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
     space = Space(tuple(p for _, p in parameters))
     try:
-        check_alone(space)
+        check_single_inertia(space)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for p in space.parameters:

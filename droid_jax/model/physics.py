@@ -21,7 +21,7 @@ import numpy as np
 from droid_jax.model.mjx_internals import array_fields, quat_multiply, tendon_jacobian
 from droid_jax.model.parameters import Space, Write
 from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
-from droid_jax.model.pseudo_inertia import as_written, check_alone, nominal, weights
+from droid_jax.model.pseudo_inertia import as_written, check_single_inertia, inertial_fields, nominal_field
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
@@ -110,7 +110,7 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
     changed = {}
     for field, writes in by_field.items():
         check_field(scene, field)
-        own = jnp.asarray(nominal(model, field), jnp.float32 if field == PSEUDO_INERTIA else None)
+        own = jnp.asarray(nominal_field(model, field), jnp.float32 if field == PSEUDO_INERTIA else None)
         new: dict[tuple[int, ...], jax.Array] = {}
         for column, w in writes:  # several parameters of one entry act one after the other
             new[w.index] = w.new(new.get(w.index, own[w.index]), values[column])
@@ -118,9 +118,9 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
         changed[field] = own.at[index].set(jnp.stack(list(new.values())).astype(own.dtype))
     if PSEUDO_INERTIA in changed:
         terms = changed.pop(PSEUDO_INERTIA)
-        check_alone(space)
+        check_single_inertia(space)
         for body in dict.fromkeys(w.index[0] for _, w in by_field[PSEUDO_INERTIA]):
-            for field, number in weights(scene.model, body, terms[body], jnp).items():
+            for field, number in inertial_fields(scene.model, body, terms[body], jnp).items():
                 own = changed.get(field, jnp.asarray(getattr(model, field)))
                 changed[field] = own.at[body].set(number.astype(own.dtype))
     for field in set(UNIT) & set(changed):
@@ -245,13 +245,13 @@ def _dof_average(model: Any) -> np.ndarray:
 def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
     """The C twin: a copy of the scene's MjModel with the values [D] applied and constants derived."""
     model = copy.copy(scene.model)
-    terms = nominal(model, PSEUDO_INERTIA)
+    terms = nominal_field(model, PSEUDO_INERTIA)
     for column, write in model_writes(space):
         array = terms if write.field == PSEUDO_INERTIA else getattr(model, write.field)
         array[write.index] = write.new(array[write.index], float(values[column]))
-    check_alone(space)
+    check_single_inertia(space)
     for body in {w.index[0] for _, w in model_writes(space) if w.field == PSEUDO_INERTIA}:
-        for field, number in weights(scene.model, body, terms[body]).items():
+        for field, number in inertial_fields(scene.model, body, terms[body]).items():
             getattr(model, field)[body] = number
         model.body_sameframe[body] = model.body_simple[body] = 0  # what C would take a short cut by
         model.dof_simplenum[:] = 0

@@ -75,7 +75,7 @@ def check_solid(model: mujoco.MjModel, body: int) -> None:
         )
 
 
-def check_alone(space: Space) -> None:
+def check_single_inertia(space: Space) -> None:
     """ValueError where other parameters write the weight of a body whose whole inertia is a parameter."""
     whole = {w.index[0]: w.element for p in space.parameters for w in p.writes if w.field == FIELD}
     for p in space.parameters:
@@ -85,7 +85,7 @@ def check_alone(space: Space) -> None:
             )
 
 
-def nominal(model: Any, field: str) -> Any:
+def nominal_field(model: Any, field: str) -> Any:
     """A field's own numbers: of a model, C's or MJX's, or of body_pseudo_inertia, which has none yet."""
     return np.zeros((model.nbody, len(TERMS))) if field == FIELD else getattr(model, field)
 
@@ -98,7 +98,7 @@ def as_written(writes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[tuple[s
     return tuple(out)
 
 
-def weights(model: mujoco.MjModel, body: int, terms: Any, xp: ModuleType = np) -> dict[str, Any]:
+def inertial_fields(model: mujoco.MjModel, body: int, terms: Any, xp: ModuleType = np) -> dict[str, Any]:
     """The numbers of `WEIGHTS` of a body for its ten terms.
 
     Args:

@@ -25,7 +25,7 @@ from droid_jax.files import SYNTHETIC_SOURCE as SOURCE
 from droid_jax.model.fields import time_offset
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.pseudo_inertia import nominal
+from droid_jax.model.pseudo_inertia import nominal_field
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.clocks import interpolate
@@ -262,7 +262,7 @@ def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Sp
 def _own_value(scene: Scene, parameter: Parameter) -> float:
     """The parameter's value in the scene as it is."""
     first = parameter.writes[0]
-    return float(first.neutral(nominal(scene.model, first.field)[first.index]))
+    return float(first.neutral(nominal_field(scene.model, first.field)[first.index]))
 
 
 def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:

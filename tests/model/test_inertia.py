@@ -26,7 +26,7 @@ from droid_jax.model.mjcf import fitted_files, fitted_mjcf
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, inertia_parameters, root_of, weights
+from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, inertia_parameters, inertial_fields, root_of
 from droid_jax.model.scene import Scene, compile_scene
 
 XML = """<mujoco><option integrator="implicitfast"/><worldbody>
@@ -145,11 +145,11 @@ def assert_alike(one: dict[str, Any], two: dict[str, Any], rtol: float) -> None:
 @given(terms=terms_strategy)
 @settings(deadline=None, max_examples=50)
 def test_every_value_is_a_body_that_can_exist(limb: Scene, terms: np.ndarray):
-    numbers = weights(limb.model, 1, terms)
+    numbers = inertial_fields(limb.model, 1, terms)
     moments = numbers["body_inertia"]
     assert numbers["body_mass"] == pytest.approx(2.0 * np.exp(2 * terms[0])) and np.all(moments > 0)
     assert 2 * moments.max() < moments.sum() and np.linalg.norm(numbers["body_iquat"]) == pytest.approx(1.0)
-    on_device = weights(limb.model, 1, jnp.asarray(terms, jnp.float32), jnp)
+    on_device = inertial_fields(limb.model, 1, jnp.asarray(terms, jnp.float32), jnp)
     assert_alike({f: np.asarray(v) for f, v in on_device.items()}, numbers, 2e-4)
 
 
@@ -157,18 +157,18 @@ def test_every_value_is_a_body_that_can_exist(limb: Scene, terms: np.ndarray):
 @settings(deadline=None, max_examples=30)
 def test_every_body_that_can_exist_has_its_values(limb: Scene, terms: np.ndarray, other: np.ndarray):
     """From any body to any other: the terms are the logarithm of what lies between both roots."""
-    aim, model = weights(limb.model, 1, terms), mujoco.MjSpec.from_string(LIMB).compile()
-    for field, number in weights(limb.model, 1, other).items():
+    aim, model = inertial_fields(limb.model, 1, terms), mujoco.MjSpec.from_string(LIMB).compile()
+    for field, number in inertial_fields(limb.model, 1, other).items():
         getattr(model, field)[1] = number
     factor = np.linalg.solve(root_of(*of(model, 1).values()), root_of(*aim.values()))
     size, whole = np.log(factor[3, 3]), factor / factor[3, 3]
     found = [size, *np.log(np.diag(whole)[:3]), whole[0, 1], whole[1, 2], whole[0, 2], *whole[:3, 3]]
-    assert_alike(weights(model, 1, np.array(found)), aim, 1e-7)
+    assert_alike(inertial_fields(model, 1, np.array(found)), aim, 1e-7)
 
 
 def test_zero_is_the_body_itself(limb: Scene):
     for body in (1, 2):
-        assert_alike(weights(limb.model, body, np.zeros(10)), of(limb.model, body), 1e-12)
+        assert_alike(inertial_fields(limb.model, body, np.zeros(10)), of(limb.model, body), 1e-12)
 
 
 def test_a_replay_has_the_inertia_of_an_mjcf_that_states_it(limb: Scene):
@@ -177,7 +177,7 @@ def test_a_replay_has_the_inertia_of_an_mjcf_that_states_it(limb: Scene):
     values = np.random.default_rng(2).normal(0.0, 0.3, 20)
     spec = limb.spec.copy()
     for body in (1, 2):
-        numbers, element = weights(limb.model, body, values[10 * (body - 1) : 10 * body]), spec.bodies[body]
+        numbers, element = inertial_fields(limb.model, body, values[10 * (body - 1) : 10 * body]), spec.bodies[body]
         element.explicitinertial, element.mass = True, float(numbers["body_mass"])
         element.ipos, element.iquat = numbers["body_ipos"].tolist(), numbers["body_iquat"].tolist()
         element.inertia = numbers["body_inertia"].tolist()
