@@ -155,7 +155,7 @@ def test_springs_and_tendons_pull_on_either_side_and_dry_friction_on_the_motors(
 
 @pytest.mark.parametrize(("side", "gravity"), [(MOTOR, True), pytest.param(LINK, False, marks=pytest.mark.slow)])
 def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
-    """Masses, springs, tendons, friction at rest and what is behind the sensor: two rows of values and the means, two motions."""
+    """Masses, springs, tendons, friction at rest and what is behind the sensor, along two motions."""
     scene = planar(spring='stiffness="5" springref="0.3" frictionloss="0.7"', more=TENDON)
     sensed = [
         sensor_parameter(scene.joints, term, "b", std=0.1, high=2.0)
