@@ -288,7 +288,7 @@ def _inverse_in_c(
     )
 
     def batch(values: np.ndarray, path: Path) -> Rollout:
-        felt = PathTorques(*(_single(part) for part in bodies(values, path)))
+        felt = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
         return each(jnp.asarray(values, jnp.float32), felt, path)
 
     def torques(values: jax.Array, paths: Path) -> jax.Array:

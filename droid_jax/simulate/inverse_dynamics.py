@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -179,9 +179,9 @@ class PathTorques(NamedTuple):
     torque: N m (N).  loss: all dry friction, N m (N), that behind a sensor too.  inertia: kg m^2 (kg), about the joint.
     """
 
-    torque: jax.Array
-    loss: jax.Array
-    inertia: jax.Array
+    torque: Any
+    loss: Any
+    inertia: Any
 
 
 def path_sensors(
