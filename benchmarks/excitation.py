@@ -134,10 +134,10 @@ def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.nda
 
 
 def identifiable(
-    scene: Scene, space: Space, recordings: Sequence[Recording], config: IdentifyConfig = FITS
+    scene: Scene, space: Space, recordings: Sequence[Recording], config: IdentifyConfig, judge: Sequence[Recording] = ()
 ) -> dict[str, bool]:
-    """What a fit finds."""
-    found = identify_parameters(scene, space, recordings, config=config)
+    """What a fit finds.  judge: logs that judge it; without them the last third of a log without commands would."""
+    found = identify_parameters(scene, space, recordings, config=config, judge_on=judge)
     return {t.name: t.identifiable for t in found.identifiability}
 
 
@@ -160,8 +160,9 @@ Record = Callable[[str, np.ndarray, np.ndarray, int], Recording]
 
 
 def of_motion(
-    scene: Scene, space: Space, kind: str, seed: int, log: Recording, record: Record, fits: IdentifyConfig
-) -> dict[str, Any]:
+    scene: Scene, space: Space, kind: str, seed: int, log: Recording, record: Record, fits: IdentifyConfig,
+    judge: Sequence[Recording] = (),
+) -> dict[str, Any]:  # fmt: skip
     """What is said of a poor log, what a fit finds, and what a fit finds with the motion that is proposed.
 
     record: (name, [K] s, [K, J] rad, seed) -> a recording of that motion on the same robot.
@@ -170,13 +171,13 @@ def of_motion(
     began = time.monotonic()
     proposal: MotionProposal = propose(scene, space, found, log)
     seconds = found.seconds + time.monotonic() - began
-    fit = identifiable(scene, space, [log], fits)
+    fit = identifiable(scene, space, [log], fits, judge)
     row: dict[str, Any] = {
         "robot": scene.name, "motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit,
     }  # fmt: skip
     if proposal.chosen:
         clock, command = proposal.commands()
-        after = identifiable(scene, space, [log, record("added", clock, command, seed + 1)], fits)
+        after = identifiable(scene, space, [log, record("added", clock, command, seed + 1)], fits, judge)
         row |= {"added": [a.what for a in proposal.chosen], "added_s": proposal.seconds, "after": after}
         row["identifiable_by_it"] = list(proposal.opened)
     return row
@@ -217,7 +218,8 @@ def of_synthetic_panda(kind: str, seed: int) -> dict[str, Any]:
     moving = np.arange(7) < (3 if kind == "three joints" else 7)
     path = start + size * np.clip(clock, 0, 1)[:, None] ** 2 * waves * moving
     fits = replace(FITS, engine="mujoco")
-    return of_motion(scene, space, kind, seed, record("poor", clock, path, seed), record, fits)
+    judge = [record("judge", clock, path, seed + 2)]
+    return of_motion(scene, space, kind, seed, record("poor", clock, path, seed), record, fits, judge)
 
 
 def of_panda(folder: Path) -> dict[str, Any] | None:
@@ -227,10 +229,11 @@ def of_panda(folder: Path) -> dict[str, Any] | None:
         return None
     fitted = json.loads((ROOT / "experiments" / "results" / "real_panda.json").read_text())
     first, last = case.recording.span
-    log = case.recording.window(first, first + (last - first) * 2 / 3)
+    cut = first + (last - first) * 2 / 3
+    log, judge = case.recording.window(first, cut), replace(case.recording.window(cut, last), name="last third")
     compare, space = CompareConfig(motion_cutoff=8.0), joint_friction_space(case.scene.joints)
     found = excitation(case.scene, space, [log], ExcitationConfig(compare=compare))
-    fit = identifiable(case.scene, space, [log], replace(FITS, engine="mujoco", compare=compare))
+    fit = identifiable(case.scene, space, [log], replace(FITS, engine="mujoco", compare=compare), [judge])
     names = {p["name"]: bool(p["identifiable"]) for p in fitted["models"]["friction"]["parameters"]}
     return {"motion": "panda/exciting", "seconds": found.seconds, "said": said(found), "fit": fit, "committed": names}
 
