@@ -85,7 +85,7 @@ class Problem:
     judge: list[Recording]
 
 
-def problem(name: str, arguments: Arguments) -> Problem:
+def problem(name: str, arguments: Arguments, folder: Path) -> Problem:
     """Of a name out of PROBLEMS."""
     if name == "go2":
         files = HERE / "go2_leg.xml", HERE / "go2.json"
@@ -98,9 +98,11 @@ def problem(name: str, arguments: Arguments) -> Problem:
         logs = {(m, g): xl330_log(arguments.data / "bam_xl330", m, g) for m in MOTIONS for g in GAINS}
         fit = [log for (_, gain), log in logs.items() if gain != JUDGE]
         judge = [log for (_, gain), log in logs.items() if gain == JUDGE]
-    joints = fit[0].channel("position").columns
-    scene = load_scene(files[0], joints=joints, friction_joints=friction_joints(files[1]))
-    return Problem(scene, load_parameters(files[1], scene), files, fit, judge)
+    entries = [e for e in json.loads(files[1].read_text()) if "inertia" not in e]  # which PACE does not fit
+    asked = folder / f"{name}_parameters.json"
+    write_json(asked, entries)
+    scene = load_scene(files[0], joints=fit[0].channel("position").columns, friction_joints=friction_joints(asked))
+    return Problem(scene, load_parameters(asked, scene), (files[0], asked), fit, judge)
 
 
 def pace(task: Problem, arguments: Arguments) -> np.ndarray:
@@ -134,7 +136,7 @@ def pace(task: Problem, arguments: Arguments) -> np.ndarray:
 
 def one(name: str, program: str, arguments: Arguments, folder: Path) -> dict[str, Any]:
     """What a program makes of a problem."""
-    task, began = problem(name, arguments), time.monotonic()
+    task, began = problem(name, arguments, folder), time.monotonic()
     if program == "ours":
         runs = folder / f"{name}_ours"
         paths = kept([*task.fit, *task.judge], folder / f"{name}_logs")

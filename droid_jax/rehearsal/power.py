@@ -26,7 +26,8 @@ CHUNK = 4e6  # numbers of a batch of flips
 class Smallest:
     """The smallest size of one coefficient that is found often enough.
 
-    size: in the coefficient's unit; inf where none within its bounds is.  limits: what each condition alone asks for.
+    size: in the coefficient's unit, with the margin; inf where none within its bounds is.  limits: what each condition
+    alone asks for, without it.
     limit: the one that decides.  noncentrality: of `size` in the score test.
     """
 
@@ -69,7 +70,8 @@ def smallest_sizes(
         }
         limits = {name: float(np.quantile(a, config.share, method="higher")) for name, a in drawn.items()} | fixed
         each = np.maximum(np.max(list(drawn.values()), axis=0), max(fixed.values()))
-        found, limit = float(np.quantile(each, config.share, method="higher")), max(limits, key=limits.__getitem__)
+        found = config.margin * float(np.quantile(each, config.share, method="higher"))
+        limit = max(limits, key=limits.__getitem__)
         if found > model.room[k]:
             found, limit = np.inf, "beyond its bounds"
         out.append(Smallest(found, limits, limit, found * strength))

@@ -43,7 +43,7 @@ from droid_jax.rehearsal.quick import quick_rehearsal, rehearsed
 from droid_jax.run import main
 
 REPEATS, LENGTH, DIRECTIONS, BASE = 10, 160, 12, 4
-CONFIG, CASES = RehearsalConfig(draws=64), 60
+CONFIG, CASES = RehearsalConfig(draws=64, margin=1.0), 60  # the linear model is the oracle
 WIDE = np.full(BASE, 10.0)
 HINGE = Path(__file__).resolve().parents[2] / "experiments" / "hinge.xml"
 JOINTS, SECONDS, REACH = ("door",), 3.0, 0.25
