@@ -4,9 +4,10 @@
 
 Poor motions of a two-link arm (one joint at rest, slow, small, quick), recorded in C MuJoCo on arms with other masses,
 damping, friction and armature.  Of each: what the check says of its nine parameters beside what a fit then finds; and
-the proposed motion, recorded on the same arm, and what a fit of both finds.  With --real DIR also the log of a real
-Panda (franka_gaz2019), beside the committed fit of experiments/real_panda.py, which is another program's path: its own
-filter and time blocks.
+the proposed motion, recorded on the same arm, and what a fit of both finds.  Likewise poor motions of a Panda, logs
+without commands of torques behind its gears, whose joint friction is fitted.  With --real DIR also the log of a real
+Panda (franka_gaz2019): beside a fit of the same log, and beside the committed fit of experiments/real_panda.py, which
+is another program's path: its own filter and time blocks.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,12 @@ runtime.tune()
 import mujoco
 import numpy as np
 import tyro
+from scipy import interpolate, signal
 
 from benchmarks.check_cases import JOINTS, KP, RATE, measured, played, real, two_link
 from benchmarks.common import publish
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.door.scene import panda_arm_scene
 from droid_jax.identify.additions import MotionProposal, propose
 from droid_jax.identify.excitation import Excitation, ExcitationConfig, excitation
 from droid_jax.identify.multistart import RefineConfig
@@ -44,10 +47,13 @@ from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss,
 from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
 SECONDS = 8.0  # of a poor motion
 MOTIONS = ("shoulder alone", "elbow alone", "slow", "small", "quick and small", "both")
+PANDA = ("three joints", "slow", "small")  # motions of the Panda
+PANDA_NOISE = (1e-5, 0.1)  # rad, N m
+SMOOTH = 5.0  # Hz, up to which it follows a path
 FITS = IdentifyConfig(
     search=CmaConfig(population=32, parents=None, generations=15),
     refine=RefineConfig(basin_hops=0),
@@ -60,8 +66,8 @@ FITS = IdentifyConfig(
 class Compared:
     """Compare what the check says of parameters with what fits find.
 
-    real: folder of public logs.  quick: two motions of one arm.  out: folder of excitation.json.  seed: of the arms.
-    arms: each makes every motion.
+    real: folder of public logs.  quick: two motions of one arm, one of a Panda.  out: folder of excitation.json.
+    seed: of the arms.  arms: each makes every motion.
     """
 
     real: Path | None = None
@@ -127,9 +133,11 @@ def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.nda
     )  # fmt: skip
 
 
-def identifiable(scene: Scene, space: Space, recordings: Sequence[Recording]) -> dict[str, bool]:
-    """What a fit finds."""
-    found = identify_parameters(scene, space, recordings, config=FITS)
+def identifiable(
+    scene: Scene, space: Space, recordings: Sequence[Recording], config: IdentifyConfig, judge: Sequence[Recording] = ()
+) -> dict[str, bool]:
+    """What a fit finds.  judge: logs that judge it; without them the last third of a log without commands would."""
+    found = identify_parameters(scene, space, recordings, config=config, judge_on=judge)
     return {t.name: t.identifiable for t in found.identifiability}
 
 
@@ -141,33 +149,93 @@ def said(found: Excitation) -> dict[str, bool]:
 def of_arm(scene: Scene, space: Space, kind: str, seed: int) -> dict[str, Any]:
     """One poor motion of one arm."""
     model = arm(scene, seed)
-    log = recorded("poor", model, *motion(kind), seed)
+
+    def record(name: str, clock: np.ndarray, command: np.ndarray, seed: int) -> Recording:
+        return recorded(name, model, clock, command, seed)
+
+    return of_motion(scene, space, kind, seed, record("poor", *motion(kind), seed), record, FITS)
+
+
+Record = Callable[[str, np.ndarray, np.ndarray, int], Recording]
+
+
+def of_motion(
+    scene: Scene, space: Space, kind: str, seed: int, log: Recording, record: Record, fits: IdentifyConfig,
+    judge: Sequence[Recording] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """What is said of a poor log, what a fit finds, and what a fit finds with the motion that is proposed.
+
+    record: (name, [K] s, [K, J] rad, seed) -> a recording of that motion on the same robot.
+    """
     found = excitation(scene, space, [log])
     began = time.monotonic()
     proposal: MotionProposal = propose(scene, space, found, log)
     seconds = found.seconds + time.monotonic() - began
-    fit = identifiable(scene, space, [log])
-    row: dict[str, Any] = {"motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit}
+    fit = identifiable(scene, space, [log], fits, judge)
+    row: dict[str, Any] = {
+        "robot": scene.name, "motion": kind, "seed": seed, "seconds": seconds, "said": said(found), "fit": fit,
+    }  # fmt: skip
     if proposal.chosen:
         clock, command = proposal.commands()
-        after = identifiable(scene, space, [log, recorded("added", model, clock, command, seed + 1)])
+        after = identifiable(scene, space, [log, record("added", clock, command, seed + 1)], fits, judge)
         row |= {"added": [a.what for a in proposal.chosen], "added_s": proposal.seconds, "after": after}
         row["identifiable_by_it"] = list(proposal.opened)
     return row
 
 
+def of_synthetic_panda(kind: str, seed: int) -> dict[str, Any]:
+    """One poor motion of a Panda with other masses and with friction behind its gears, without commands."""
+    scene = panda_arm_scene()
+    space, rng = joint_friction_space(scene.joints), np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(scene.spec.to_xml())
+    model.body_mass[1:] *= rng.uniform(0.98, 1.02, model.nbody - 1)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    viscous, coulomb, offset = (rng.uniform(low, high, 7) for low, high in ((0.1, 0.5), (0.1, 0.5), (-0.3, 0.3)))
+    start = np.array([0.0, 0.2, 0.0, -1.8, 0.0, 1.6, 0.5])
+
+    def record(name: str, clock: np.ndarray, path: np.ndarray, seed: int) -> Recording:
+        rate, noise = 1.0 / float(np.median(np.diff(clock))), np.random.default_rng(seed)
+        lowpass = signal.butter(2, SMOOTH, fs=rate, output="sos")
+        followed = interpolate.make_interp_spline(clock, signal.sosfiltfilt(lowpass, path, axis=0), k=5)
+        q, v, a = (followed.derivative(n)(clock) if n else followed(clock) for n in range(3))
+        data, torque = mujoco.MjData(model), np.empty(q.shape)
+        for k in range(len(clock)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a[k]
+            mujoco.mj_inverse(model, data)
+            torque[k] = data.qfrc_inverse + data.qfrc_passive - model.dof_armature * a[k]  # behind the gears
+        torque = torque + viscous * v + coulomb * np.tanh(v / 1e-3) + offset
+        columns = (("position", "rad", q, PANDA_NOISE[0]), ("torque", "N m", torque, PANDA_NOISE[1]))
+        channels = {}
+        for of, unit, clean, size in columns:
+            values = (clean + noise.normal(0.0, size, clean.shape))[None]
+            channels[of] = Channel(of, unit, scene.joints, clock, values, np.ones(values.shape, bool))
+        convention = TorqueConvention(TorqueSide.LINK, gravity=True)
+        return Recording(name, np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={})
+
+    clock = np.arange(0.0, SECONDS, 0.01)
+    quick, size = 0.3 if kind == "slow" else 1.0, 0.03 if kind == "small" else 0.4
+    waves = np.sin(2 * np.pi * quick * np.linspace(0.3, 0.6, 7) * clock[:, None])
+    moving = np.arange(7) < (3 if kind == "three joints" else 7)
+    path = start + size * np.clip(clock, 0, 1)[:, None] ** 2 * waves * moving
+    fits = replace(FITS, engine="mujoco")
+    judge = [record("judge", clock, path, seed + 2)]
+    return of_motion(scene, space, kind, seed, record("poor", clock, path, seed), record, fits, judge)
+
+
 def of_panda(folder: Path) -> dict[str, Any] | None:
-    """The Panda's log, its first two thirds, beside the committed fit."""
+    """The Panda's log, its first two thirds, beside a fit of it and beside the committed one."""
     case = next((c for c in real(folder) if c.name == "panda/exciting"), None)
     if case is None:
         return None
     fitted = json.loads((ROOT / "experiments" / "results" / "real_panda.json").read_text())
     first, last = case.recording.span
-    log = case.recording.window(first, first + (last - first) * 2 / 3)
-    config = ExcitationConfig(compare=CompareConfig(motion_cutoff=8.0))
-    found = excitation(case.scene, joint_friction_space(case.scene.joints), [log], config)
+    cut = first + (last - first) * 2 / 3
+    log, judge = case.recording.window(first, cut), replace(case.recording.window(cut, last), name="last third")
+    compare, space = CompareConfig(motion_cutoff=8.0), joint_friction_space(case.scene.joints)
+    found = excitation(case.scene, space, [log], ExcitationConfig(compare=compare))
+    fit = identifiable(case.scene, space, [log], replace(FITS, engine="mujoco", compare=compare), [judge])
     names = {p["name"]: bool(p["identifiable"]) for p in fitted["models"]["friction"]["parameters"]}
-    return {"motion": "panda/exciting", "seconds": found.seconds, "said": said(found), "fit": names}
+    return {"motion": "panda/exciting", "seconds": found.seconds, "said": said(found), "fit": fit, "committed": names}
 
 
 def main(command: Compared) -> dict[str, Any]:
@@ -180,27 +248,39 @@ def main(command: Compared) -> dict[str, Any]:
         for kind in kinds:
             rows.append(of_arm(scene, space, kind, 10 * seed))
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+        for kind in PANDA[:1] if command.quick else PANDA:
+            rows.append(of_synthetic_panda(kind, 10 * seed))
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     return summary(rows, of_panda(command.real) if command.real is not None else None)
 
 
 def summary(rows: list[dict[str, Any]], panda: dict[str, Any] | None) -> dict[str, Any]:
     """What is published of the motions, and of the Panda."""
-    agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
-    added = [(row["after"][n]) for row in rows if "after" in row for n in row["identifiable_by_it"]]
-    opened = [n for row in rows for n, known in row["said"].items() if not known]
-    result = {
-        "parameters_judged": len(agreeing),
-        "agreement": float(np.mean(agreeing)),
-        "open_before": len(opened),
-        "identifiable_by_addition": len(added),
-        "addition_confirmed": float(np.mean(added)) if added else None,
-        "slowest_s": max(row["seconds"] for row in rows),
-        "motions": rows,
-    }
+    names = list(dict.fromkeys(row["robot"] for row in rows))
+    result = {**_counted(rows), "robots": {name: _counted([r for r in rows if r["robot"] == name]) for name in names}}
     if panda is not None:
         result["panda"] = panda
-        result["panda_agreement"] = float(np.mean([panda["said"][n] == panda["fit"][n] for n in panda["said"]]))
-    return result
+        for of in ("fit", "committed"):
+            result[f"panda_agreement_{of}"] = float(np.mean([panda["said"][n] == panda[of][n] for n in panda["said"]]))
+    return {**result, "motions": rows}
+
+
+def _counted(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """How often the check and a fit agree.  Of what a fit leaves open: the share with the addition."""
+    agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
+    added = [row["after"][n] for row in rows if "after" in row for n in row["identifiable_by_it"]]
+    missing = [(row, n) for row in rows for n, known in row["fit"].items() if not known]
+    found = [row.get("after", row["fit"])[n] for row, n in missing]
+    return {
+        "parameters_judged": len(agreeing),
+        "agreement": float(np.mean(agreeing)),
+        "open_before": sum(not known for row in rows for known in row["said"].values()),
+        "identifiable_by_addition": len(added),
+        "addition_confirmed": float(np.mean(added)) if added else None,
+        "open_in_fit": len(found),
+        "identifiable_in_fit_with_addition": float(np.mean(found)) if found else None,
+        "slowest_s": max(row["seconds"] for row in rows),
+    }
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from two_link import ARM, JOINTS, measured, motion, recording
 
 from benchmarks.check_cases import RATE, played
 from benchmarks.check_cases import measured as recorded_channels
+from droid_jax.identify.additions import Addition, MotionProposal
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
@@ -148,6 +149,12 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     assert table.dtype.names == ("time", *JOINTS)
     assert np.all(np.diff(table["time"]) > 0) and np.ptp([*table["shoulder"], *table["elbow"] + 0.3]) > 0.05
     assert [table[j][k] for j in JOINTS for k in (0, -1)] == pytest.approx([0.0, 0.0, -0.3, -0.3])
+
+
+def test_a_motion_that_is_proposed_several_times_is_said_once():
+    ramp, steps = (Addition(what, "elbow", np.arange(7.0), np.zeros(7)) for what in ("a slow ramp", "steps"))
+    proposal = MotionProposal((ramp, steps, ramp), (), ("mass",), (), ("elbow",), np.zeros(1), 2)
+    assert proposal.sentence == "To tell mass, record besides 2 times a slow ramp, steps: 18 s."
 
 
 def test_bad_calls(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

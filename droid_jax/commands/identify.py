@@ -83,8 +83,9 @@ class Identify:
     user_effects: Path | None = None
     """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """mjx: compiled, all devices.  mujoco: plain C, all cores; for motor-side torques, without gravity where the
-    scene compensates it.  auto: plain C for recordings of one repeat, on a CPU, where C can replay them; else MJX."""
+    """mjx: compiled, all devices.  mujoco: plain C, all cores; of commanded logs for motor-side torques, without
+    gravity where the scene compensates it.  auto: plain C for commanded recordings of one repeat, on a CPU, where C can
+    replay them; else MJX."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None

@@ -7,6 +7,7 @@ picked greedily by what they gain for each second.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -80,7 +81,8 @@ class MotionProposal:
         left += ": another load, more repeats or a narrower prior may." if left else ""
         if not self.opened:
             return left
-        motions = ", ".join(a.what for a in self.chosen)
+        counts = Counter(a.what for a in self.chosen)
+        motions = ", ".join(what if times == 1 else f"{times} times {what}" for what, times in counts.items())
         return f"To tell {', '.join(self.opened)}, record besides {motions}: {self.seconds:.0f} s. {left}".strip()
 
     def commands(self) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from evosax.algorithms import CMA_ES
 
 from droid_jax.identify.gaussian import redraw_box
 from droid_jax.model.parameters import Space
@@ -118,6 +117,8 @@ class _Kernels(NamedTuple):
 @cache  # a study runs many searches of one size: compile them once
 def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
     """The compiled algebra for P rows of D parameters, `redraws` draws per row."""
+    from evosax.algorithms import CMA_ES  # only here: its import takes half a second
+
     evosax = CMA_ES(population, jnp.zeros(dims), fitness_shaping_fn=_ranked_weights)
 
     def init(seed: Any, x: Any, params: Any) -> Any:

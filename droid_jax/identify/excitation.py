@@ -37,7 +37,7 @@ from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.c_reference import why_not_in_c
+from droid_jax.simulate.c_reference import why_no_path_in_c, why_not_in_c
 
 DAMPINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1000.0)  # of the trial steps, as shares of the curvature
 LENGTHS = (1.0, 0.5, 0.2)  # shares of a whole step: with the dampings one block of a CPU
@@ -134,7 +134,7 @@ def excitation(
     engine = engine_for(scene, space, short)
     with silent():
         cost = make_cost(scene, space, short, engine=engine, config=config.compare, check=False)
-    refined, cost = _stepped(cost, space, config)
+    refined, cost = _stepped(cost, space, config, engine)
     gaussian = posterior(refined, cost.comparisons, config.identifiability)
     longer = sum(r.duration for r in recordings) / sum(s.duration for s in short)
     known = np.linalg.inv(gaussian.cov) - np.eye(len(space))
@@ -165,8 +165,11 @@ def identifiability_of(
 def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> str:
     """Plain C where it can replay the recordings, which compiles nothing; else MJX."""
     contacts = scene.grip is not None or scene.model.npair
-    if contacts or any(not r.command.size or why_not_in_c(scene, space, r.torque, ()) for r in recordings):
-        return "mjx"
+    for recording in recordings:
+        if recording.command.size and (contacts or why_not_in_c(scene, space, recording.torque, ())):
+            return "mjx"
+        if not recording.command.size and why_no_path_in_c(scene, space, recording.torque, ()):
+            return "mjx"
     return "mujoco"
 
 
@@ -192,7 +195,7 @@ def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
     return np.nan_to_num((residuals[1:] - residuals[0]) / steps[:, None]).T
 
 
-def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refined, Cost]:
+def _stepped(cost: Cost, space: Space, config: ExcitationConfig, engine: str) -> tuple[Refined, Cost]:
     """Where a few Levenberg-Marquardt steps lead from the means, and the cost with its noise stated from there.
 
     The steps are taken in the noise that is known before a fit; what they leave then tells the noise of one repeat.
@@ -210,14 +213,19 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig) -> tuple[Refine
         jacobian = jacobian_of(residuals, steps)
         slope = jacobian.T @ residuals[0] + x / prior**2
         free = off_bounds(x, slope, low, high)
-        steps_of = curvature(jacobian, prior), slope, free, DAMPINGS, LENGTHS, config.longest_step
-        trials = np.clip(x + damped_steps(*steps_of), low, high)
-        if count == config.steps:
+        steps_of = curvature(jacobian, prior), slope, free, DAMPINGS
+        # A compiled block holds all lengths; in C, where each replay counts, shorter ones wait for the longer to fail.
+        tried = [LENGTHS] if engine == "mjx" else [(length,) for length in LENGTHS]
+        better = None
+        for lengths in tried if count < config.steps else ():
+            trials = np.clip(x + damped_steps(*steps_of, lengths, config.longest_step), low, high)
+            reached = penalised(trials, np.asarray(cost.whitened(space.from_search(trials)), np.float64), prior)
+            if np.min(reached) < (1 - config.worth) * now:
+                better = trials[int(np.argmin(reached))]
+                break
+        if better is None:
             break
-        reached = penalised(trials, np.asarray(cost.whitened(space.from_search(trials)), np.float64), prior)
-        if not np.min(reached) < (1 - config.worth) * now:
-            break
-        x, count = trials[int(np.argmin(reached))], count + 1
+        x, count = better, count + 1
     stated = [c.restated(r) if c.repeats == 1 else c for c, r in zip(cost.comparisons, first, strict=True)]
     cost = cost.compared_by(stated)
     residuals = cost.whitened_of(rollouts)

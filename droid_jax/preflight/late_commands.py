@@ -18,7 +18,8 @@ APART = 0.015  # s within which the delays of joints are one
 BETTER = 0.5  # share of what is left without the delay that a delay leaves
 LEVELS = 50  # different values, below which a column is coarse and its largest one may be frequent
 CLOSE = 1e-4  # of a column's span within which values are one
-SHARE = 0.01  # of the samples that a limit must hold
+SHARE = 0.01  # of the samples that a limit must hold,
+RESTS = 0.002  # and a column that never goes below its 0
 RUN = 5  # samples in a row
 
 
@@ -87,7 +88,7 @@ def _limit(channel: Channel, column: int) -> tuple[float, float] | None:
     for limit in (every.max(), every.min()):
         at = [np.abs(v - limit) <= CLOSE * np.ptp(every) for v in values]
         share = float(np.concatenate(at).mean())
-        if share > SHARE and _longest(at) >= RUN:
+        if share > (SHARE if limit else RESTS) and _longest(at) >= RUN:
             return float(limit), share
     return None
 

@@ -116,8 +116,8 @@ def warn_if_moving(recording: Recording) -> None:
     moving = [j for i, j in enumerate(channel.columns) if _moves(recording.time[0], channel, i)]
     if moving:
         warnings.warn(
-            f"recording {recording.name!r} begins while {', '.join(moving)} moves, and a replay begins at rest: let "
-            "the recording begin where the robot stands still",
+            f"recording {recording.name!r} begins while {' and '.join(moving)} move{'s' * (len(moving) == 1)}, and a "
+            "replay begins at rest: let the recording begin where the robot stands still",
             stacklevel=2,
         )
 

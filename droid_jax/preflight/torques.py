@@ -1,7 +1,8 @@
 """Whether the measured torques are those of the motion: sign, unit, order of the joints, and the arm's weight.
 
-Three expectations, each at the scene's nominal values: the rigid body's torque along the measured motion, the servo's
-at the measured tracking error and, where no position was measured, the replay's.  Each is fitted within bounds that a
+Three expectations, each at the scene's nominal values: the rigid body's torque along the measured motion (of joints
+that friction alone holds back: the sign of its work), the servo's at the measured tracking error and, where no
+position was measured, the replay's.  Each is fitted within bounds that a
 wrong model may reach; what it leaves of the torque is compared with what it leaves under an alternative.
 """
 
@@ -40,6 +41,9 @@ VISIBLE, CLEARLY = 0.03, 0.1  # share from which on the weight in a torque is lo
 ROUGH = 400  # rows of a motion at which alternatives are tried where the expectation has not failed
 MOST = 3  # joints of which all orders of the positions are tried
 ROTOR = 100.0  # times a link's own inertia, that a rotor behind its gear may have
+SMALL = 0.1  # share of a torque's root mean square, up to which weight and inertia have no part in it
+TAKEN = 0.5  # share of the work done, that must go against the motion
+HUGE = 100.0  # times what the scene says that the motion takes
 SURE = 0.05  # share below which it does so beyond doubt
 SAME = 0.25  # relative deviation within which a factor is that of degrees
 DEGREE = np.pi / 180
@@ -54,7 +58,11 @@ def check_torque(scene: Scene, recording: Recording, motion: LogMotion) -> list[
     if not motion.position:
         return _of_replay(scene, recording, motion)
     bodies = rigid_body(scene, recording, motion)
-    return _of_bodies(scene, recording, motion, bodies) or _of_servos(scene, recording, motion, bodies)
+    return (
+        _of_bodies(scene, recording, motion, bodies)
+        or _of_work(scene, recording, motion, bodies)
+        or _of_servos(scene, recording, motion, bodies)
+    )
 
 
 # What is left ---------------------------------------------------------------------------------
@@ -155,8 +163,10 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     explained = [w for w in whole if explains(w[2], stated, bad or list(stated), 1.0 if bad else CLEARLY)]
     others_right = len(bad) < len(bodies)
     alone = {
-        joint: _alone(joint, torques[joint], bodies[joint], gravity, motor, stated[joint], others_right)
-        for joint in bad
+        joint: _alone(
+            joint, torques[joint], bodies[joint], gravity, motor, stated[joint], others_right, 1.0 if bad else CLEARLY
+        )
+        for joint in bad or [joint for joint, left in stated.items() if left > VISIBLE]
     }
     best = min(explained, key=lambda w: _mean(w[2]), default=None)
     where = f"recording {recording.name!r}: "
@@ -216,17 +226,25 @@ def _better(left: float, stated: float) -> bool:
 
 
 def _alone(
-    joint: str, torque: np.ndarray, body: Expected, gravity: bool, motor: bool, stated: float, others_right: bool
-) -> tuple[Finding, float] | None:
-    """What is wrong with one joint's torque: its sign or its unit; with what it leaves."""
+    joint: str, torque: np.ndarray, body: Expected, gravity: bool, motor: bool, stated: float, others_right: bool,
+    share: float,
+) -> tuple[Finding, float] | None:  # fmt: skip
+    """What is wrong with one joint's torque: its sign or its unit; with what it leaves.
+
+    share: of what the torque as stated leaves, that it may at most.
+    """
+
+    def better(left: float) -> bool:
+        return _better(left, stated) and left < share * stated
+
     left = partial(left_by_body, expected=body, gravity=gravity, motor=motor)
     expected = body.weight * gravity + body.inertial
     size = factor(torque, expected, *friction_terms(body))
     by = "weight, inertia and friction"
-    if _better(turned := left(-torque), stated):
+    if better(turned := left(-torque)):
         words = f"the torque of {joint} has the wrong sign, or its position has"
         return _finding("sign", joint, joint, stated, turned, words, by, value=-1.0), turned
-    if size != 0 and not 1 / BOUND < abs(size) < BOUND and _better(scaled := left(torque / size), stated):
+    if size != 0 and not 1 / BOUND < abs(size) < BOUND and better(scaled := left(torque / size)):
         if size < 0:
             words = f"the torque of {joint} is {size:.2g} of what the motion takes"
             return _finding("sign", joint, joint, stated, scaled, words, by, value=size), scaled
@@ -237,6 +255,43 @@ def _alone(
             words += " Or does the robot carry a load that the scene lacks?"
         return _finding("units", joint, joint, stated, scaled, words, by, value=size), scaled
     return None
+
+
+# Joints that friction alone holds back -------------------------------------------------------
+
+
+def _of_work(scene: Scene, recording: Recording, motion: LogMotion, bodies: Mapping[str, Expected]) -> list[Finding]:
+    """By the work that friction takes, where neither weight nor spring acts and inertia is small; and by its size."""
+    found, passive = [], []
+    for joint, body in bodies.items():
+        torque, dof = motion.torque[joint][motion.inner], scene.dof(joint)
+        size = _rms(torque)
+        own = _rms(body.weight) * recording.torque.gravity + _rms(body.inertial)
+        springs = scene.model.jnt_stiffness[scene.model.dof_jntid[dof]] or scene.model.tendon_stiffness.any()
+        if size < 1e-9 or own > SMALL * size or springs:
+            continue
+        passive.append(joint)
+        where, power = f"recording {recording.name!r}: the torque of {joint}", torque * body.velocity
+        work = float(power.sum() / (np.abs(power).sum() + 1e-12))
+        if work < -TAKEN:
+            words = (
+                f"{where} works against the motion ({-100 * work:.0f} % of it), and friction takes work: it has the "
+                "wrong sign, or its position has (or a spring that the scene lacks drives the joint)"
+            )
+            found.append(Finding("sign", joint, work, -TAKEN, "likely", words))
+            continue
+        friction = scene.model.dof_frictionloss[dof] + scene.model.dof_damping[dof] * _rms(body.velocity)
+        if friction > 0 and size > HUGE * (friction + own):
+            words = (
+                f"{where} is {size / (friction + own):.2g} times what inertia, weight and friction of the scene take"
+            )
+            sentence = f"{words}: {_unit_words(size)}"
+            found.append(Finding("units", joint, size, HUGE * float(friction + own), "likely", sentence))
+    return _register(found, passive)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 # The servo ------------------------------------------------------------------------------------

@@ -28,8 +28,8 @@ from typing import Any, ParamSpec, cast
 import matplotlib
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -227,11 +227,15 @@ def _bytes(figure: Figure, kind: str) -> bytes:
 
     By its canvas, since `savefig` would draw all of a settled figure once more to arrange it.
     """
-    canvas, background, metadata = {
-        "svg": (FigureCanvasSVG, "none", {"Date": None, "Creator": None}),
-        "pdf": (FigureCanvasPdf, "white", {"CreationDate": None}),
-        "png": (FigureCanvasAgg, "white", {"Software": None}),
-    }[kind]
+    canvas: type[FigureCanvasBase]
+    if kind == "pdf":
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf as canvas  # only here: it imports fontTools
+
+        background, metadata = "white", {"CreationDate": None}
+    elif kind == "svg":
+        canvas, background, metadata = FigureCanvasSVG, "none", {"Date": None, "Creator": None}
+    else:
+        canvas, background, metadata = FigureCanvasAgg, "white", {"Software": None}
     with matplotlib.rc_context(STYLE), io.BytesIO() as buffer:
         figure.set_facecolor(background)
         figure.set_dpi(STYLE["savefig.dpi"])

@@ -1,4 +1,4 @@
-"""The C twin of the servo replay: the same commands, values and outputs through plain C MuJoCo.
+"""The C twin of the replays: the same commands or motions, values and outputs through plain C MuJoCo.
 
 It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
 that write model fields, what a servo makes of its whole command, and the torque offsets; everything else needs MJX.
@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Rollout, complete
@@ -21,6 +22,7 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.initial_state import weight_share
+from droid_jax.simulate.inverse_dynamics import Path, PathTorques
 from droid_jax.simulate.replay import Drive, check_stateless, profiled
 from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
@@ -95,6 +97,65 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         return "its torque is the actuators': motor-side, and without gravity where the scene compensates it"
     if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
         return "it compensates gravity where joints are, not where encoders say"
+    return ""
+
+
+def c_path_torques(
+    scene: Scene, space: Space, convention: TorqueConvention, joints: Sequence[str]
+) -> Callable[[np.ndarray, Path], PathTorques]:
+    """values [P, D], path -> what the path takes of the scene's joints, [P, T, J], double precision.
+
+    The equation is that of `path_replay`.  Each set of model fields is computed once, whatever the sensors are.
+    """
+    dofs, positions = [scene.dof(j) for j in joints], [scene.qpos(j) for j in joints]
+    motor, of_joints = convention.side is TorqueSide.MOTOR, scene.joint_dofs
+    columns = [i for i, p in enumerate(space.parameters) if p.writes]
+    off = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+
+    def of_model(row: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """[T, J] torques and inertias of a row of values [D], and [J] its motors' dry friction."""
+        model = make_c_model(scene, space, row)
+        model.opt.disableflags |= off
+        if not motor:
+            model.dof_armature[:] = model.dof_damping[:] = 0.0
+        if not convention.gravity:
+            model.opt.gravity[:] = 0.0
+        data, mass = mujoco.MjData(model), np.empty((model.nv, model.nv))
+        torques, inertias = np.empty((2, len(path.time), len(of_joints)))
+        acceleration = np.zeros(model.nv)
+        data.qpos[:] = np.asarray(path.still)
+        rows = (np.asarray(a, np.float64) for a in (path.position, path.velocity, path.acceleration))
+        for k, (q, v, a) in enumerate(zip(*rows, strict=True)):
+            data.qpos[positions], data.qvel[dofs], acceleration[dofs] = q, v, a
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fullM(model, data, mass)
+            force = mass @ acceleration + data.qfrc_bias - data.qfrc_spring - data.qfrc_damper
+            torques[k], inertias[k] = force[of_joints], np.diagonal(mass)[of_joints]
+        own = model.dof_frictionloss[of_joints] if motor else np.zeros(len(of_joints))
+        return torques + own * np.sign(np.asarray(path.velocity)[:, : len(of_joints)]), inertias, own
+
+    def torques_of(values: np.ndarray, path: Path) -> PathTorques:
+        values = np.atleast_2d(np.asarray(values, np.float64))
+        first, again = np.unique(values[:, columns], axis=0, return_index=True, return_inverse=True)[1:]
+        found = [of_model(values[i], path) for i in first]
+        torque, inertia, own = (np.stack([f[k] for f in found])[again.ravel()] for k in range(3))
+        behind = np.array(
+            [[theta_of(space, row).get(Role.COULOMB.in_theta(j), 0.0) for j in scene.joints] for row in values]
+        )
+        loss = np.broadcast_to((own + behind)[:, None], torque.shape)
+        return PathTorques(torque, loss, inertia)
+
+    return torques_of
+
+
+def why_no_path_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
+    """Why plain C cannot replay a measured motion; empty where it can.  The arguments are those of `why_not_in_c`."""
+    functions = ("command", "servo", "profile", "force", "frictionloss")
+    if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
+        return f"effects depend on the state: {', '.join(active)}"
+    if not torque.gravity and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
+        return "the weight was taken out where encoders say, not where joints are"
     return ""
 
 

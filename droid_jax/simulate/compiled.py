@@ -18,16 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effect_interface import Effect, Rollout, complete
 from droid_jax.model.inertia import free_inertias, inertia_possible
 from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
 from droid_jax.model.parameters import Role, Space, Write
 from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
+from droid_jax.model.unsupported_features import refuse_fluid
 from droid_jax.recordings.recording import TorqueConvention
 from droid_jax.simulate.batching import over_block
-from droid_jax.simulate.c_reference import c_replay
-from droid_jax.simulate.inverse_dynamics import Path, motion_path, path_replay
+from droid_jax.simulate.c_reference import c_path_torques, c_replay, why_no_path_in_c
+from droid_jax.simulate.inverse_dynamics import Path, PathTorques, motion_path, path_replay, path_sensors
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import (
     TORQUE_OFFSETS,
@@ -121,15 +122,14 @@ def compiled_replay(
         mj_step: step as the C engine does.
 
     Raises:
-        ValueError: a measured motion with mj_step or in plain C, or gains that the scene does not have.
+        ValueError: a measured motion with mj_step, what plain C does not have, or gains that the scene does not have.
     """
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
         if mj_step:
             raise ValueError("mj_step replays commands; this recording has none")
-        if engine != "mjx":
-            raise ValueError("a recording without commands is replayed by inverse dynamics, which needs engine 'mjx'")
-        batch, torques = _inverse_program(scene, layout, effects, follows.torque, follows.joints)
+        program = _inverse_program if engine == "mjx" else _inverse_in_c
+        batch, torques = program(scene, layout, effects, follows.torque, follows.joints)
         means = jnp.asarray(space.mean, jnp.float32)
         return Along(batch, scene, follows, lambda paths: torques(means, paths))
     check_gains(scene, follows)
@@ -263,6 +263,39 @@ def _inverse_program(
         compiler_options=runtime.compiler_options(),
     )
     return over_block(_of_bodies(scene, space, replay)), torques
+
+
+@functools.lru_cache(maxsize=PROGRAMS)
+def _inverse_in_c(
+    scene: Scene,
+    layout: Layout,
+    effects: tuple[Effect, ...],
+    torque: TorqueConvention,
+    joints: tuple[str, ...],
+) -> tuple[Callable[..., Rollout], Callable[[jax.Array, Path], jax.Array]]:
+    """The same in plain C, but for what the sensors make of it."""
+    space = layout.space
+    if why := why_no_path_in_c(scene, space, torque, effects):
+        raise ValueError(f"the C engine cannot replay this: {why}; use MJX")
+    refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
+    bodies, sense = c_path_torques(scene, space, torque, joints), path_sensors(scene, torque, effects, joints)
+
+    def read(values: jax.Array, felt: PathTorques, path: Path) -> Rollout:
+        return sense(complete(theta_of(space, values), effects), path, felt)
+
+    each = jax.jit(
+        jax.vmap(_of_bodies(scene, space, read), in_axes=(0, 0, None)), compiler_options=runtime.compiler_options()
+    )
+
+    def batch(values: np.ndarray, path: Path) -> Rollout:
+        felt = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
+        return each(jnp.asarray(values, jnp.float32), felt, path)
+
+    def torques(values: jax.Array, paths: Path) -> jax.Array:
+        row = np.asarray(values)[None]
+        return jnp.stack([batch(row, Path(*(a[n] for a in paths))).torque[0] for n in range(len(paths.time))])
+
+    return batch, torques
 
 
 def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -131,6 +131,7 @@ def path_replay(
     dofs, positions = np.array([scene.dof(j) for j in joints]), np.array([scene.qpos(j) for j in joints])
     compensated = 1.0 - scene.model.jnt_actgravcomp[scene.model.dof_jntid]
     motor = convention.side is TorqueSide.MOTOR
+    sense = path_sensors(scene, convention, effects, joints)
 
     def replay(physics: Physics, path: Path) -> Rollout:
         model, theta = physics.model, complete(physics.theta, effects)
@@ -163,15 +164,41 @@ def path_replay(
             # What is behind the sensor `joint_friction_effect` adds, as an observation.
             friction = (loss if motor else loss - behind) * direction
             loss = loss + behind if motor else loss
-            rows = (torque + force + friction, loss * direction, loss, jnp.diagonal(inertia))
-            return tuple(row[scene.joint_dofs] for row in rows)
+            rows = (torque + force + friction, loss, jnp.diagonal(inertia))
+            return PathTorques(*(row[scene.joint_dofs] for row in rows))
 
-        torque, friction, loss, inertia = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
-        hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
-        count = len(scene.joints)
+        felt = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
+        return sense(theta, path, felt)
+
+    return replay
+
+
+class PathTorques(NamedTuple):
+    """What a path takes of the scene's joints, before their sensors, [T, J] each.
+
+    torque: N m (N).  loss: all dry friction, N m (N), that behind a sensor too.  inertia: kg m^2 (kg), about the joint.
+    """
+
+    torque: Any
+    loss: Any
+    inertia: Any
+
+
+def path_sensors(
+    scene: Scene, convention: TorqueConvention, effects: Sequence[Effect] = (), joints: Sequence[str] = ()
+) -> Callable[[Theta, Path, PathTorques], Rollout]:
+    """What sensors read of the torques along a path, which at rest are those nearest to the measured ones.
+
+    The arguments are those of `path_replay`.
+    """
+    joints, count = joints or scene.joints, len(scene.joints)
+    motor = convention.side is TorqueSide.MOTOR
+    hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
+
+    def sense(theta: Theta, path: Path, felt: PathTorques) -> Rollout:
         rollout = Rollout(
             time=path.time,
-            torque=torque,
+            torque=felt.torque,
             position=path.position[:, :count],
             velocity=path.velocity[:, :count],
             object_angle=jnp.zeros(len(path.time)) if hinge is None else path.position[:, hinge],
@@ -180,13 +207,14 @@ def path_replay(
         )
         seen = apply_sensor_model(rollout, theta, effects)
         # The slack is there without friction too: else any friction would pay by taking the noise at rest.
-        slack = jnp.hypot(path.torque_slack[:count], inertia * path.acceleration_slack[:count])
-        bound = jnp.maximum(loss, 0.0) + slack
+        slack = jnp.hypot(path.torque_slack[:count], felt.inertia * path.acceleration_slack[:count])
+        bound = jnp.maximum(felt.loss, 0.0) + slack
+        friction = felt.loss * jnp.sign(path.velocity[:, :count])
         held = held_torque(seen.torque - friction, bound, path.measured[:, :count])
         rest = path.at_rest[:, :count] & _may_rub(scene, theta, effects, motor)
         return replace(seen, torque=jnp.where(rest, held, seen.torque))
 
-    return replay
+    return sense
 
 
 def _may_rub(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool) -> np.ndarray:

@@ -160,9 +160,11 @@ def test_a_motion_on_another_clock_is_refused(scene: Scene, space: Space):
 
 
 @pytest.mark.slow
-def test_the_c_engine_has_no_inverse_mode(scene: Scene, space: Space):
-    with pytest.raises(ValueError, match="inverse dynamics, which needs engine 'mjx'"):
-        make_cost(scene, space, [log(1)], engine="mujoco")
+def test_plain_c_gives_the_same_cost(scene: Scene, space: Space):
+    rows = np.stack([space.mean, space.values({"slide_damping": 15.0, "coulomb[slide]": 2.0})])
+    mjx, c = (make_cost(scene, space, [log(3)], engine=engine) for engine in ("mjx", "mujoco"))
+    np.testing.assert_allclose(c.distances(rows), mjx.distances(rows), rtol=1e-4)
+    np.testing.assert_allclose(c.whitened(rows), mjx.whitened(rows), rtol=1e-4, atol=0.02)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.check_log import check_alone, check_log
 from droid_jax.preflight.torques import fitting_order
-from droid_jax.recordings.recording import Recording, ServoGains, TorqueConvention, TorqueSide
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
 REPEATS = 3
 SIZE = 0.12  # rad, of the small motion: seven degrees
@@ -322,3 +322,52 @@ def test_a_dead_column_of_a_log_without_commands():
     silent = of_channel("torque", lambda v: v * np.array([0.0, 1.0]))(recording(commands=False))
     (finding,) = check_alone(silent)
     assert "the torque of shoulder does not move" in finding.sentence and finding.severity == "likely"
+
+
+def hinge(spring: float = 0.0, mass: float = 0.01) -> Scene:
+    """A door: friction holds it back, its weight does not act."""
+    xml = f"""<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" axis="0 0 1" frictionloss="1"
+    stiffness="{spring}"/><geom type="box" pos=".15 0 0" size=".15 .01 .2" mass="{mass}"/></body></worldbody>
+    </mujoco>"""
+    return compile_scene(mujoco.MjSpec.from_string(xml), "door", joints=["hinge"])
+
+
+def opened(factor: float, inertia: float = 0.0, uneven: float = 1.2) -> Recording:
+    """It is opened slowly against an uneven friction, and closed; the torque times a factor, with noise."""
+    time = np.arange(0.0, 10.0, 0.01)
+    w, swing = 0.2 * np.pi, 0.5
+    angle, speed = swing * (1 - np.cos(w * time)), swing * w * np.sin(w * time)
+    force = np.sign(speed) * (1.0 + uneven * np.sin(20.0 * angle)) + inertia * swing * w**2 * np.cos(w * time)
+    rng = np.random.default_rng(0)
+    columns = (("position", "rad", angle, 1e-4), ("torque", "N m", force, 0.05))
+    channels = {
+        name: Channel(
+            name, unit, ("hinge",), time, (clean + rng.normal(0, noise, len(time)))[None, :, None] * size,
+            np.ones((1, len(time), 1), bool),
+        )
+        for (name, unit, clean, noise), size in zip(columns, (1.0, factor), strict=True)
+    }  # fmt: skip
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    return Recording("door", np.zeros(0), np.zeros((0, 0)), (), channels, convention, qpos0={})
+
+
+def test_friction_takes_work():
+    assert check_log(hinge(), opened(1.0)) == ()
+    assert check_log(hinge(), opened(9.0)) == ()  # the scene's friction is a guess
+    (turned,) = check_log(hinge(), opened(-1.0))
+    assert (turned.kind, turned.column, turned.severity) == ("sign", "hinge", "likely")
+    assert "works against the motion" in turned.sentence
+    assert check_log(hinge(spring=5.0), opened(-1.0)) == ()  # a spring may drive it
+
+
+def test_a_torque_a_thousand_times_the_friction():
+    (milli,) = check_log(hinge(), opened(1000.0))
+    assert (milli.kind, milli.severity) == ("units", "likely") and "milliamperes" in milli.sentence
+
+
+def test_a_small_inertia_beside_friction_in_another_unit():
+    """Friction is of free size, and leaves too little for the torque to count as unexplained."""
+    heavy = hinge(mass=3.0 / 0.03)
+    assert check_log(heavy, opened(1.0, 3.0, 0.05)) == ()
+    (milli,) = check_log(heavy, opened(1000.0, 3.0, 0.05))
+    assert milli.kind == "units" and "of what the motion takes: are these milliamperes" in milli.sentence

@@ -18,11 +18,13 @@ from droid_jax.door.scene import ARM, door_scene
 from droid_jax.door.space import torque_offsets
 from droid_jax.identify.holdout import split_repeats
 from droid_jax.model.effect_interface import Effect, Rollout
-from droid_jax.model.fields import body_mass, joint_damping
+from droid_jax.model.fields import body_mass, joint_damping, joint_encoder_offset, joint_frictionloss
+from droid_jax.model.joint_friction import sensor_parameter
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.compiled import compiled_replay
 from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay, torque_offset_effect
@@ -31,7 +33,7 @@ MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
 PLANAR = """<mujoco><compiler angle="radian"/><worldbody>
   <body {gravcomp}><joint name="a" axis="0 1 0" armature="0.1" damping="2" {spring}/>
     <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="2"/>
-    <body pos=".3 0 0" {gravcomp}><joint name="b" axis="0 1 0" armature="0.05" damping="1"/>
+    <body name="elbow" pos=".3 0 0" {gravcomp}><joint name="b" axis="0 1 0" armature="0.05" damping="1"/>
       <geom type="capsule" size=".02" fromto="0 0 0 .2 0 .1" mass="1" contype="0"/></body></body>
 </worldbody><actuator><position joint="a" kp="9"/><position joint="b" kp="9"/></actuator>{more}</mujoco>"""
 TENDON = """<tendon><fixed stiffness="20" damping="3" springlength="0.1">
@@ -149,6 +151,45 @@ def test_gravity_is_the_recordings_choice_not_the_files(gravcomp: bool, side: To
 def test_springs_and_tendons_pull_on_either_side_and_dry_friction_on_the_motors(side: TorqueSide):
     """A joint's spring, a tendon's, and a friction loss that opposes the motion."""
     check_planar(planar(spring='stiffness="5" springref="0.3" frictionloss="0.7"', more=TENDON), side, False)
+
+
+@pytest.mark.parametrize(("side", "gravity"), [(MOTOR, True), pytest.param(LINK, False, marks=pytest.mark.slow)])
+def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
+    """Masses, springs, tendons, friction at rest and what is behind the sensor, along two motions."""
+    scene = planar(spring='stiffness="5" springref="0.3" frictionloss="0.7"', more=TENDON)
+    sensed = [
+        sensor_parameter(scene.joints, term, "b", std=0.1, high=2.0)
+        for term in ("viscous", "coulomb", "torque_offset", "torque_gain")
+    ]
+    parameters = [body_mass(scene, "elbow", std=0.3, high=5.0), joint_frictionloss(scene, "a", std=0.3, high=3.0)]
+    if gravity:  # else only MJX knows the weight that was taken out where the encoder says
+        parameters.append(joint_encoder_offset(scene, "a", std=0.1, high=0.5))
+    space = Space((*parameters, *sensed))
+    values = np.tile(space.mean, (4, 1))
+    values[1:, 0], values[2:, 1:] = 1.7, 0.2
+    given = motion(scene, side, gravity)
+    given = replace(
+        given, rest=np.abs(given.velocity) < 0.4, measured=np.random.default_rng(3).normal(size=given.velocity.shape)
+    )
+    later = replace(given, position=given.position[::-1])
+    for follows in (given, later):
+        one, other = (compiled_replay(e, scene, space, follows, ()) for e in ("mjx", "mujoco"))
+        mjx, c = one(values), other(values)
+        np.testing.assert_allclose(c.torque, mjx.torque, atol=5e-5)
+        assert np.asarray(c.finite).all() and np.ptp(np.asarray(c.torque), axis=0).max() > 0.1
+        paths = jax.tree.map(lambda a: jnp.stack([a, a]), motion_path(scene, follows))
+        np.testing.assert_allclose(other.torques(paths), one.torques(paths), atol=5e-5)
+
+
+def test_plain_c_refuses_what_it_does_not_have():
+    scene = planar()
+    pull = Effect("pull", force=lambda theta, state: state.qvel)
+    space = Space(torque_offsets(scene.joints))
+    with pytest.raises(ValueError, match="effects depend on the state: pull; use MJX"):
+        compiled_replay("mujoco", scene, space, motion(scene, LINK, True), [pull])
+    turned = Space((joint_encoder_offset(scene, "a", std=0.1, high=0.5),))
+    with pytest.raises(ValueError, match="taken out where encoders say, not where joints are; use MJX"):
+        compiled_replay("mujoco", scene, turned, motion(scene, LINK, False), ())
 
 
 def log(columns: Sequence[str], holes: bool = False) -> Recording:
