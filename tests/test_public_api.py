@@ -57,7 +57,7 @@ LOADED = {  # from little to much: each piece of code runs behind those before i
     "from droid_jax import load_scene, door_scene, Scene, door_space, door_nuisances": {"mujoco"},
     "from droid_jax import make_cost": {"jax", "mujoco"},
     # evosax needs flax
-    "from droid_jax import find_missing_effects, DiscrepancyConfig": {"jax", "mujoco", "evosax", "flax"},
+    "from droid_jax import find_missing_effects, DiscrepancyConfig": {"jax", "mujoco"},
 }
 
 
