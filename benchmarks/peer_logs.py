@@ -29,7 +29,7 @@ import tuned  # noqa: E402, F401  (before jax starts)
 import json  # noqa: E402
 import subprocess  # noqa: E402
 import time  # noqa: E402
-from collections.abc import Sequence  # noqa: E402
+from collections.abc import Callable, Sequence  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
 from typing import Any  # noqa: E402
 
@@ -40,7 +40,9 @@ from xl330_logs import GAINS, MOTIONS, xl330_log  # noqa: E402
 
 from benchmarks.common import publish, stem  # noqa: E402
 from benchmarks.peers import sysid  # noqa: E402
+from droid_jax.cost.residuals import CompareConfig  # noqa: E402
 from droid_jax.identify.evaluation import evaluate_on, evaluation_json  # noqa: E402
+from droid_jax.model.effect_interface import Rollout  # noqa: E402
 from droid_jax.model.parameter_file import friction_joints, load_parameters  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
 from droid_jax.model.scene import Scene, load_scene  # noqa: E402
@@ -110,11 +112,12 @@ def pace(task: Problem, arguments: Arguments) -> np.ndarray:
     import cmaes
 
     low, high = task.space.low, task.space.high
-    replays = [
-        (c_replay(task.scene, task.space, drive, late=0.0), drive.time, recording)
-        for recording in task.fit
-        for drive in (make_drive(task.scene, recording),)
-    ]
+    replays = list[tuple[Callable[[np.ndarray], Rollout], np.ndarray]]()  # with what was measured on their clocks
+    for recording in task.fit:
+        drive, channel = make_drive(task.scene, recording), recording.channel("position")
+        measured = interpolate(drive.time, channel.time - recording.time[0], channel.values[0])
+        replays.append((c_replay(task.scene, task.space, drive, late=0.0), measured))
+    instants = sum(len(measured) for _, measured in replays)
     search = cmaes.CMA(
         mean=np.zeros(len(low)), sigma=0.5, bounds=np.tile([-1.0, 1.0], (len(low), 1)), seed=0,
         population_size=arguments.population,
@@ -122,11 +125,9 @@ def pace(task: Problem, arguments: Arguments) -> np.ndarray:
     for _ in range(5 if arguments.quick else arguments.generations):
         rows = np.stack([search.ask() for _ in range(arguments.population)])
         scores = np.zeros(len(rows))
-        for replay, clock, recording in replays:
-            channel = recording.channel("position")
+        for replay, measured in replays:
             simulated = replay(low + 0.5 * (rows + 1.0) * (high - low)).position
-            measured = interpolate(clock, channel.time - recording.time[0], channel.values[0])
-            scores += np.sum((simulated - measured) ** 2, axis=(1, 2)) / sum(len(c) for _, c, _ in replays)
+            scores += np.sum((simulated - measured) ** 2, axis=(1, 2)) / instants
         scores = np.where(np.isfinite(scores), scores, 1e6)
         search.tell(list(zip(rows, scores.tolist(), strict=True)))
         if np.ptp(scores) < 0.01 * scores.min():
@@ -148,7 +149,10 @@ def one(name: str, program: str, arguments: Arguments, folder: Path) -> dict[str
     else:
         best = pace(task, arguments) if program == "pace" else _sysid(task, arguments)
         seconds = time.monotonic() - began
-        judged = evaluate_on(task.scene, task.space, task.judge, before=task.space.mean, after=best, engine="mujoco")
+        config = CompareConfig(mj_step=True)  # as they step
+        judged = evaluate_on(
+            task.scene, task.space, task.judge, before=task.space.mean, after=best, engine="mujoco", config=config
+        )
         errors = evaluation_json(judged)["mean_mae"]["position"]["after"]
         values = dict(zip(task.space.names, best.tolist(), strict=True))
     return {"heldout_mae": errors, "fit_seconds": round(seconds, 1), "values": values}

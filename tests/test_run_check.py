@@ -117,7 +117,7 @@ def test_a_certain_finding_stops_a_fit_before_anything_is_compiled(
 
 
 def poor() -> Recording:
-    """The elbow stands still: its damping and friction cannot be told."""
+    """The elbow stands still: its damping and friction are not identifiable."""
     time, command = motion(3.0, RATE)
     command = command * [0.2, 0.0] + [0.0, -0.3]
     model = mujoco.MjModel.from_xml_string(
@@ -137,14 +137,14 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     out = tmp_path / "check"
     files = ["--recording", str(path), "--scene", str(scene), "--parameters", str(parameters)]
     assert main(["check", *files, "--out", str(out)]) == 0
-    told = json.loads((out / "check.json").read_text())["excitation"]
-    assert told["engine"] == "mujoco"
-    open_ones = {p["name"] for p in told["parameters"] if not p["identifiable"]}
-    assert open_ones == {"elbow_damping"} == {*told["identifiable_by_it"]} and told["left_open"] == []
-    assert told["addition"]
+    excitation = json.loads((out / "check.json").read_text())["excitation"]
+    assert excitation["engine"] == "mujoco"
+    open_ones = {p["name"] for p in excitation["parameters"] if not p["identifiable"]}
+    assert open_ones == {"elbow_damping"} == {*excitation["identifiable_by_it"]} and excitation["left_open"] == []
+    assert excitation["addition"]
     said = " ".join(capsys.readouterr().out.split())
     assert "What these recordings tell of the parameters" in said and "record besides" in said
-    assert told["sentence"] in (out / "check.html").read_text()
+    assert excitation["sentence"] in (out / "check.html").read_text()
     table = np.genfromtxt(out / "addition.csv", delimiter=",", names=True)
     assert table.dtype.names == ("time", *JOINTS)
     assert np.all(np.diff(table["time"]) > 0) and np.ptp([*table["shoulder"], *table["elbow"] + 0.3]) > 0.05

@@ -1,4 +1,4 @@
-"""Parameter values -> a model to simulate: `Physics` for MJX and the C twin for MuJoCo.
+"""Parameter values -> a model to simulate: `Physics` for MJX and its counterpart for MuJoCo in C.
 
 Mass, inertia and geometry enter quantities that the compiler derives (inverse weights, the
 diagonal of the inertia matrix, subtree masses).  Both paths derive them again, so that applying
@@ -243,14 +243,16 @@ def _dof_average(model: Any) -> np.ndarray:
 
 
 def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
-    """The C twin: a copy of the scene's MjModel with the values [D] applied and constants derived."""
+    """The counterpart in C: a copy of the scene's MjModel with the values [D] applied and constants derived."""
     model = copy.copy(scene.model)
     terms = nominal_field(model, PSEUDO_INERTIA)
     for column, write in model_writes(space):
         array = terms if write.field == PSEUDO_INERTIA else getattr(model, write.field)
         array[write.index] = write.new(array[write.index], float(values[column]))
-    check_single_inertia(space)
-    for body in {w.index[0] for _, w in model_writes(space) if w.field == PSEUDO_INERTIA}:
+    bodies = {w.index[0] for _, w in model_writes(space) if w.field == PSEUDO_INERTIA}
+    if bodies:
+        check_single_inertia(space)
+    for body in bodies:
         for field, number in inertial_fields(scene.model, body, terms[body]).items():
             getattr(model, field)[body] = number
         model.body_sameframe[body] = model.body_simple[body] = 0  # what C would take a short cut by

@@ -1,4 +1,4 @@
-"""Plain C MuJoCo, many rollouts at once on all cores: used by the synthetic robot and by the C twin."""
+"""Plain C MuJoCo, many rollouts at once on all cores: used by the synthetic robot and by the replays in C."""
 
 from __future__ import annotations
 

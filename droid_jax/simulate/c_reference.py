@@ -1,4 +1,4 @@
-"""The C twin of the replays: the same commands or motions, values and outputs through plain C MuJoCo.
+"""The counterpart of the replays in C: the same commands or motions, values and outputs through plain C MuJoCo.
 
 It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
 that write model fields, what a servo makes of its whole command, and the torque offsets; everything else needs MJX.

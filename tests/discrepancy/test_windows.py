@@ -182,7 +182,7 @@ def test_the_noise_of_a_window_holds_the_spread_of_its_state():
 
 
 def test_a_motion_that_is_replayed_whole_may_begin_elsewhere(space: Space):
-    """What a wrong start leaves is in the noise, and is told by the instants that count alone."""
+    """What a wrong start leaves is in the noise, and follows from the instants that count alone."""
     truth, right = space.values(TRUE), swung("a", 1.0, 0.7, noise=NOISE)
     off = replace(right, qpos0={joint: start + 20 * NOISE for joint, start in right.measured_start().items()})
     log, noise = whole_log(space, [off]).about(truth), np.full(1, NOISE)
