@@ -21,7 +21,7 @@ from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import posterior_of
-from droid_jax.identify.levenberg_marquardt import principal_axes
+from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
@@ -114,6 +114,7 @@ def one_step_fit(
     part: Candidate,
     sensitivities: Mapping[str, np.ndarray],
     proposed: np.ndarray,
+    config: LevenbergMarquardtConfig | None = None,
 ) -> tuple[np.ndarray, float]:
     """A model with one more effect after one step, with slopes that are known already: values [D], objective.
 
@@ -126,6 +127,7 @@ def one_step_fit(
         part: the effect.
         sensitivities: coefficient -> [M] what a unit of it adds to the simulation at `model`, in one repeat's noise.
         proposed: [D] the model with the effect's coefficients at their linear best.
+        config: of the step.
     """
     whole = residual_set.cost.space
     space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
@@ -140,7 +142,7 @@ def one_step_fit(
         return residual_set.whitened(whole.embed(space, rows, without))
 
     starts = np.stack([without, proposed])[:, whole.columns(space)]
-    values, objective = chord(residuals, space, starts, jacobian)
+    values, objective = chord(residuals, space, starts, jacobian, config)
     return whole.embed(space, values[None], without)[0], objective
 
 

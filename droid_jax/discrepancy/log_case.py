@@ -211,6 +211,7 @@ def with_blocks(
 
 
 PARTS = 2  # training and validation
+FEWER_TRIALS = {"dampings": (1e-2, 1e0, 1e1, 1e3), "lengths": (1.0,)}  # of long logs, where each row of a batch counts
 DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
 BEST = 1  # of them
 LEAST_TEST = 4  # units of a test part
@@ -255,7 +256,8 @@ def windowed_case(
         scene: the robot.
         base: all that is fitted without any effect.
         effects: to ask about.
-        train: commanded recordings of the same channels, of one repeat or several.
+        train: commanded recordings of the same channels, of one repeat or several.  Of long ones that would be replayed
+            whole a number of windows is (`WindowConfig.longest`).
         test: others.
         config: of the search.
 
@@ -268,13 +270,19 @@ def windowed_case(
     scene, whole = ready(scene), joined(base, effects)
     share = 1.0 if test else config.blocks.fitted_share
     at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
-    compare, windows = config.compare, config.windows
+    compare, windows, judging = config.compare, config.windows, config.windows
+    if sampled := config.replay == "auto" and at_once and _seconds(train) > windows.longest:
+        at_once, judging = False, windows.sampled(_seconds(test))
+        windows = windows.sampled(share * _seconds(train))
+        config = replace(
+            config, **{name: replace(getattr(config, name), **FEWER_TRIALS) for name in ("refine", "refit", "polish")}
+        )
     log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
     own = per_recording_nuisances(base) if test else []
     judged = None
     if test:
-        judged = windowed_log(scene, unbounded(whole, own), test, compare, windows, effects, whole=at_once)
+        judged = windowed_log(scene, unbounded(whole, own), test, compare, judging, effects, whole=at_once)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
     first = _first_values(log, base, effects, end, rough)
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
@@ -292,7 +300,18 @@ def windowed_case(
         sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
     last = sets[2] if len(sets) > PARTS else None
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
+    if sampled and not log.whole:
+        limits.insert(
+            0,
+            f"{_seconds(train):.0f} s of motion take long to replay: {int(log.unit.max()) + 1} windows of "
+            f"{windows.length:g} s, spread evenly, stand for them (--replay whole replays all of it).",
+        )
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
+
+
+def _seconds(recordings: Sequence[Recording]) -> float:
+    """s, of all their repeats."""
+    return sum(recording.duration * recording.repeats for recording in recordings)
 
 
 def open_loop_errors(

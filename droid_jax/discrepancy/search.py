@@ -218,7 +218,8 @@ def _one_step_fits(
         problem.progress("one_step_fit", names_of((*model.keys, part.key)))
         rows = {d.coefficient: k for k, d in enumerate(found.directions) if d.candidate.shaped_key == part.shaped_key}
         raw = {a: found.raw[k] for a, k in rows.items()}
-        out.append((*one_step_fit(problem.case.train, model, part, raw, start), proposal))
+        config = problem.case.config.refit
+        out.append((*one_step_fit(problem.case.train, model, part, raw, start, config), proposal))
     return out, Notes()
 
 

@@ -205,12 +205,18 @@ def refine(
     )
 
 
-def chord(residuals: Residuals, space: Space, starts: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
+def chord(
+    residuals: Residuals,
+    space: Space,
+    starts: np.ndarray,
+    jacobian: np.ndarray,
+    config: LevenbergMarquardtConfig | None = None,
+) -> tuple[np.ndarray, float]:
     """What steps with a Jacobian [M, D] known from elsewhere reach from the best start [S, D]: values [D], objective.
 
     A few batches of trials and no differences: a first look at what a refinement would find.
     """
-    problem = DampedProblem(residuals, space, LevenbergMarquardtConfig())
+    problem = DampedProblem(residuals, space, config or LevenbergMarquardtConfig())
     state = problem.start(problem.inside(space.to_search(space.check(starts))))
     state = problem.candidate_steps(state, np.repeat(jacobian[None], len(state.x), axis=0))
     best = int(np.argmin(state.objective))

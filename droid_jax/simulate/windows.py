@@ -7,13 +7,13 @@ delays find the commands that were sent before it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import mujoco
 import numpy as np
 
-from droid_jax.arguments import check_fields, number
+from droid_jax.arguments import check_fields, number, optional, whole
 from droid_jax.model.actuators import drives_joint, has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
@@ -34,16 +34,36 @@ class WindowConfig:
     lead: s, replayed before that and not compared; of a motion that is replayed whole its beginning.
     history: s, of commands before the lead-in; the longest delay that it can know.
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
+    every: s, from the beginning of one window to that of the next; None: none is left out.
+    longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them
+    samples: windows at most are replayed instead, spread evenly,
+    sample_length, sample_lead: s, of each: long enough for a joint that creeps to be seen.
     """
 
     length: float = 0.5
     lead: float = 0.2
     history: float = 0.15
     reach: float = 0.06
+    every: float | None = None
+    longest: float = 120.0
+    samples: int = 32
+    sample_length: float = 2.0
+    sample_lead: float = 0.5
 
     def __post_init__(self) -> None:
         above, least = partial(number, above=0), partial(number, least=0)
-        check_fields(self, length=above, reach=above, lead=least, history=least)
+        check_fields(
+            self,
+            **dict.fromkeys(("length", "reach", "longest", "sample_length"), above),
+            **dict.fromkeys(("lead", "history", "sample_lead"), least),
+            every=optional(above),
+            samples=partial(whole, least=1),
+        )
+
+    def sampled(self, seconds: float) -> WindowConfig:
+        """Of motions of so many seconds in all: a number of longer windows, spread evenly."""
+        every = max(self.sample_length, seconds / self.samples)
+        return replace(self, length=self.sample_length, lead=self.sample_lead, every=every)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +139,8 @@ def cut(
     earlier = finer * round(config.history / grid)
     reach = reach_of(channel, config)
     first = finer * int(np.ceil(reach / grid - 1e-6))
-    rows = np.arange(first, len(drive.command) - steps + 1, stride)
+    apart = stride if config.every is None else max(stride, finer * round(config.every / grid))
+    rows = np.arange(first, len(drive.command) - steps + 1, apart)
     if not len(rows):
         raise ValueError(
             f"recording {recording.name!r} of {recording.duration:.3g} s is shorter than one window of "
