@@ -304,7 +304,7 @@ def windowed_case(
         limits.insert(
             0,
             f"{_seconds(train):.0f} s of motion take long to replay: {int(log.unit.max()) + 1} windows of "
-            f"{windows.length:g} s, spread evenly, stand for them (--replay whole replays all of it).",
+            f"{windows.length:g} s, spread over it, stand for them (--replay whole replays all of it).",
         )
     return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
 
@@ -319,12 +319,18 @@ def open_loop_errors(
 ) -> dict[str, Any]:
     """Errors of whole replays of each recording, open loop, at two vectors [D]: what windows by themselves do not tell.
 
-    As plain data (`evaluation.evaluation_json`).
+    As plain data (`evaluation.evaluation_json`).  Effects that act in neither are left out, so that plain C can replay
+    what it has.
     """
     cost = case.train.cost
     whole = replace(case.config.compare, channels={name: 1.0 for name in case.config.compare.channels})
+    names, rows, neutral = cost.space.names, np.stack([before, after]), cost.space.mean
+    changed = {n for n, column in zip(names, (rows != neutral).any(axis=0), strict=True) if column}
+    acting = [e for e in case.effects if changed & {p.name for p in e.parameters}]
+    space = cost.space.select([*case.base.names, *(p.name for e in acting for p in e.parameters)])
+    before, after = rows[:, cost.space.columns(space)]
     replays = evaluate_on(
-        cost.scene, cost.space, list(roles.values()), before=before, after=after, effects=case.effects, config=whole
+        cost.scene, space, list(roles.values()), before=before, after=after, effects=acting, engine="auto", config=whole
     )
     found = evaluation_json(replays)
     return {name: found[name] for name in ("errors", "mean_mae")}

@@ -34,9 +34,9 @@ class WindowConfig:
     lead: s, replayed before that and not compared; of a motion that is replayed whole its beginning.
     history: s, of commands before the lead-in; the longest delay that it can know.
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
-    every: s, from the beginning of one window to that of the next; None: none is left out.
+    every: s, in each of which one window lies, at a place that differs; None: none is left out.
     longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them
-    samples: windows at most are replayed instead, spread evenly,
+    samples: windows or so are replayed instead, spread over them,
     sample_length, sample_lead: s, of each: long enough for a joint that creeps to be seen.
     """
 
@@ -46,8 +46,8 @@ class WindowConfig:
     reach: float = 0.06
     every: float | None = None
     longest: float = 120.0
-    samples: int = 32
-    sample_length: float = 2.0
+    samples: int = 24
+    sample_length: float = 1.5
     sample_lead: float = 0.5
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class WindowConfig:
         )
 
     def sampled(self, seconds: float) -> WindowConfig:
-        """Of motions of so many seconds in all: a number of longer windows, spread evenly."""
+        """Of motions of so many seconds in all: a number of longer windows, spread over them."""
         every = max(self.sample_length, seconds / self.samples)
         return replace(self, length=self.sample_length, lead=self.sample_lead, every=every)
 
@@ -139,8 +139,11 @@ def cut(
     earlier = finer * round(config.history / grid)
     reach = reach_of(channel, config)
     first = finer * int(np.ceil(reach / grid - 1e-6))
-    apart = stride if config.every is None else max(stride, finer * round(config.every / grid))
-    rows = np.arange(first, len(drive.command) - steps + 1, apart)
+    rows = np.arange(first, len(drive.command) - steps + 1, stride)
+    if config.every is not None and len(rows):
+        rows = first + finer * _spread(
+            (len(drive.command) - steps - first) // finer, stride // finer, config.every / grid
+        )
     if not len(rows):
         raise ValueError(
             f"recording {recording.name!r} of {recording.duration:.3g} s is shorter than one window of "
@@ -164,6 +167,17 @@ def cut(
     known = np.asarray(np.isfinite(start).all(axis=1) & np.isfinite(speed).all(axis=1))
     gains = np.repeat(servo_factors(scene, drive)[None], len(rows), axis=0)
     return Windows(begin, table, gains, start, speed, spread, earlier, steps).kept(known)
+
+
+def _spread(last: int, least: int, every: float) -> np.ndarray:
+    """Places from 0 to `last`, one in each stretch of `every` and `least` apart or more.
+
+    Within their stretches by the golden ratio, so that a motion that repeats is not seen at one phase alone.
+    """
+    count = max(1, round(last / every))
+    begin = np.arange(count) * last / count
+    within = (0.5 * (np.sqrt(5.0) - 1.0) * (1 + np.arange(count))) % 1.0
+    return np.floor(begin + within * max(0.0, last / count - least)).astype(int)
 
 
 def start_spread(
