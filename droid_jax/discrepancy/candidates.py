@@ -279,8 +279,9 @@ def _combinations(groups: Sequence[list[int]], number: int, found: ScoreTest) ->
         return list(groups)
 
     def together(a: Candidate, b: Candidate) -> bool:
-        """Not the same candidate; and an effect has one shape at all its locations."""
-        return a.key != b.key and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
+        """Neither holds the other's coefficients; and an effect has one shape at all its locations."""
+        apart = not {*a.coefficients} & {*b.coefficients}
+        return apart and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
 
     of = [found.directions[rows[0]].candidate for rows in groups]
     both = ((i, k) for i in range(len(of)) for k in range(i + 1, len(of)) if together(of[i], of[k]))

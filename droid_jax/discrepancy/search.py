@@ -332,7 +332,8 @@ def _collinear_candidates(done: SelectionStep, cosine: float) -> list[Proposal]:
     new = [key for key in done.selected.keys if key not in done.before]
     tried = {key for m in done.tried for key in m.keys}
     near = collinear(done.score_test, set(new), cosine)
-    return [p for p in done.ranked if p.keys[0] in near - tried]
+    held = {*done.selected.coefficients}  # a part of the winner is no other model
+    return [p for p in done.ranked if p.keys[0] in near - tried and not held.issuperset(p.parts[0].coefficients)]
 
 
 def pair_step(state: SearchState, problem: Problem) -> SearchState:

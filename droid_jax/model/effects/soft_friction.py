@@ -9,6 +9,7 @@ from droid_jax.model.scene import Scene
 
 FIRM = 0.9999  # mjMAXIMP, the firmest constraint that MuJoCo has
 FIRMNESS = "friction_firmness"
+EVERYWHERE = "all joints"  # MuJoCo's default is that of every joint, and each alone may be too little to be named
 
 
 @register
@@ -28,13 +29,14 @@ def soft_friction(scene: Scene) -> Effect | None:
     if not writes:
         return None
     names = {joint: f"{FIRMNESS}[{joint}]" for joint in writes}
+    together = {EVERYWHERE: tuple(names.values())} if len(writes) > 1 else {}
     return Effect(
         "soft_friction",
         tuple(Parameter(names[j], "-", 0.0, 0.5, 0.0, 1.0, writes=w, group=a.GROUP) for j, w in writes.items()),
         description="dry friction that holds a joint where the model's lets it creep",
         signature="a joint that rests under load, or turns back",
         confused_with=("joint_coulomb", "joint_stribeck", "servo_gain"),
-        locations=a.places(tuple(writes), FIRMNESS),
+        locations={**a.places(tuple(writes), FIRMNESS), **together},
         minimum_size=0.1,
         natural_bounds=tuple(names.values()),
     )
