@@ -1,6 +1,6 @@
 """The SO-101 arm, positions alone: fitted to two of its motions, judged on four others, through the commands alone.
 
-    python experiments/real_so101.py --data DIR
+    python experiments/real_so101.py --data DIR [--gap]
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
 friction of each of the first five joints, one armature that they share, and a delay), with the library's limit of the
@@ -11,22 +11,30 @@ of a log are what.  `evaluate-fit` replays the other motions open loop, over the
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
 control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml.  They are not part of this repository.
 Dry friction is made hard (`solimpfriction`): MuJoCo's own default creeps, and the arm stands still.
+
+With --gap: what does a model of 24 parameters and a delay (gain, armature, damping and friction of each of the six
+joints) with MuJoCo's default friction lack?  `gap` searches the four motions, and the two others are its test data.
 """
 
 from __future__ import annotations
 
+import json
 import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
-from commanded_fit import HERE, evaluated, fitted, kept, parameters_of
+from commanded_fit import HERE, command, evaluated, fitted, kept, parameters_of
 from inverse_fit import RESULTS, run
 
 from benchmarks import common
+from droid_jax.files import GAP
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
+from droid_jax.storage import write_json
 
 JUDGED = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 FIT = ("chirp_sweep", "friction_gravity")
@@ -37,6 +45,14 @@ SOURCE = (
 SECONDS = 120.0
 EFFECTS = ("profile_acceleration",)
 HARD = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction
+# Of each joint in the search: a line of a parameter file, but for its name and its element.
+OF_A_JOINT: dict[str, dict[str, Any]] = {
+    "kp": {"std": 0.4, "low": 0.2, "high": 5.0},
+    "armature": {"unit": "kg m2", "std": 0.02, "low": 0.001, "high": 0.3, "scaling": "log"},
+    "damping": {"unit": "N m s/rad", "std": 0.6, "low": 0.01, "high": 10.0, "scaling": "log"},
+    "frictionloss": {"unit": "N m", "std": 0.1, "low": 1e-6, "high": 2.0, "scaling": "log", "log_offset": 0.02},
+}
+DELAY = {"sensor": "time_offset", "std": 0.005, "high": 0.05}
 
 
 @dataclass(frozen=True)
@@ -44,6 +60,8 @@ class RealSo101:
     """Fit the SO-101 arm to positions of two motions, judge it on four others.
 
     data: folder with the motions.
+    gap: search what 24 parameters with MuJoCo's default friction lack, in place of the fit; half an hour or more.
+    budget: minutes after which that search tries no further candidate; 0: none.
     quick: the first seconds of a motion to fit and one to judge, and a short search; its numbers are not for keeping.
     seconds: of each motion, from its start.
     out: folder for real_so101.json, and for the runs below `real_so101_runs`.
@@ -51,6 +69,8 @@ class RealSo101:
     """
 
     data: Path
+    gap: bool = False
+    budget: float = 0.0
     quick: bool = False
     seconds: float = SECONDS
     out: Path = RESULTS
@@ -79,8 +99,72 @@ def hard_scene(folder: Path, out: Path) -> Path:
     return path
 
 
+def parameters_of_joints(path: Path) -> Path:
+    """The parameter file of the search."""
+    lines = [
+        {"servo" if what == "kp" else "element": joint, "name": f"{what}_{joint}", **line}
+        | ({} if what == "kp" else {"field": f"dof_{what}"})
+        for what, line in OF_A_JOINT.items()
+        for joint in (*JUDGED, "Jaw")
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps([*lines, DELAY], indent=1))
+    return path
+
+
+def searched(config: RealSo101) -> dict[str, Any]:
+    """What `gap` says of the four motions, and the errors of all six, of the first five joints."""
+    seconds = 15.0 if config.quick else config.seconds
+    of = {motion: so101_log(config.data, motion, seconds) for motion in (*JUDGES, *FIT)}
+    runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
+    paths = kept(list(of.values()), runs / "logs_of_all_joints")
+    options = ["--effects", "soft_friction"] if config.quick else []
+    options += ["--budget", str(config.budget)] if config.budget else []
+    began = time.monotonic()
+    command(
+        ["gap", "--scene", config.data / "so101_air.xml", "--joint-friction", "scene",
+         "--parameters", parameters_of_joints(runs / "so101_24.json"), *options, "--seed", str(config.seed),
+         "--recording", *(paths[m] for m in JUDGES), "--judge-on", *(paths[m] for m in FIT), "--out", runs / "gap"]
+    )  # fmt: skip
+    found = json.loads((runs / "gap" / GAP).read_text())
+    mae = {
+        when: {
+            name: round(1e3 * float(np.mean(errors["position"][f"mae_{when}"][: len(JUDGED)])), 3)
+            for name, errors in found["open_loop"]["errors"].items()
+        }
+        for when in ("before", "after")
+    }
+    before, after = (float(np.mean([mae[when][name] for name in JUDGES])) for when in ("before", "after"))
+    return {
+        **common.origin(config.seed),
+        "recordings": {r.name: r.sha256 for r in of.values()},
+        **{key: found[key] for key in ("verdict", "sentence", "p", "effects", "indistinguishable", "hints", "doubts")},
+        "limits": found["split"]["limits"],
+        "coefficients": found["coefficients"],
+        "discrepancies": found["discrepancies"],
+        "mae_mrad_before": mae["before"],
+        "mae_mrad": mae["after"],
+        "mean_of_the_four_mrad_before": round(before, 3),
+        "mean_of_the_four_mrad": round(after, 3),
+        "share_closed_of_the_four": round(1.0 - after / before, 4),
+        "ranking": found["score_tests"][0]["ranking"][:8],
+        "validation_tests": found["validation_tests"],
+        "not_tried": found.get("not_tried", []),
+        "seconds_of_stages": found["seconds"],
+        "seconds": round(time.monotonic() - began, 1),
+    }
+
+
 def main(config: RealSo101) -> None:
-    """One fit, four judges, one line of JSON."""
+    """One fit and four judges, or one search; one line of JSON."""
+    name = "real_so101_quick" if config.quick else "real_so101"
+    path = config.out / f"{name}.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    if config.gap:
+        known["gap"] = searched(config)
+        write_json(path, known, indent=2)
+        print(json.dumps({"gap": known["gap"]}))
+        return
     seconds = 4.0 if config.quick else config.seconds
     fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
     logs = [so101_log(config.data, motion, seconds) for motion in (*fit, *judges)]
@@ -116,6 +200,7 @@ def main(config: RealSo101) -> None:
         "tied": [],
         "parameters": parameters_of(found),
         "seconds": round(took, 1),
+        **({"gap": known["gap"]} if "gap" in known else {}),
     }
     common.publish(config.out, "real_so101", config.quick, config.seed, result)
 

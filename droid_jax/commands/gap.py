@@ -66,7 +66,7 @@ class GapCommand:
     """Commanded logs that are test data, beside others with few repeats."""
     replay: Literal["auto", "whole", "windows"] = "auto"
     """Commanded logs with few repeats. windows: replayed from measured states, each half a second long. whole: from
-    their beginnings. auto: whole where a servo holds every joint."""
+    their beginnings. auto: whole where a servo holds every joint, and windows of some seconds of more than two minutes."""
     fit: Path | None = None
     """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
     search."""

@@ -100,6 +100,11 @@ def test_pairs_are_ranked_together():
     assert len(best) == 10 and set(best[0].keys) == {key(0), key(2)}
     few = proposals(found, data, space, number=2, among={key(1), key(2), key(3)})
     assert len(few) == 3
+    both = Candidate("both", "all joints", ("a0", "a1"))  # holds two of the others
+    wider = (*DIRECTIONS[:3], ScoreDirection(both, "a0"), ScoreDirection(both, "a1"))
+    found = score_tested(data, wider, RAW[[0, 1, 2, 0, 1]])
+    pairs = {frozenset(p.keys) for p in proposals(found, data, space, number=2)}
+    assert pairs == {frozenset(p) for p in ((key(0), key(1)), (key(0), key(2)), (key(1), key(2)), (key(2), both.key))}
 
 
 def test_shapes_are_no_alternatives_of_each_other():

@@ -20,17 +20,18 @@ import droid_jax as dj
 from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
+from droid_jax.discrepancy import log_case
 from droid_jax.discrepancy.candidates import observable_effects
-from droid_jax.discrepancy.config import BlocksConfig
+from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene, load_scene
+from droid_jax.model.scene import Scene, load_scene, with_options
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate.windows import WindowConfig, held, joint_states, why_whole
+from droid_jax.simulate.windows import WindowConfig, _spread, held, joint_states, why_whole
 
 SHORT = WindowConfig(length=0.4, lead=0.1, history=0.05)
 NOISE = 1e-4
@@ -94,6 +95,60 @@ def test_windows_need_every_joint():
     recording = swung("a", 1.0, 1.0)
     assert why_whole(scene(), recording) == ""
     assert "no position of swing was measured" in why_whole(scene(), swung("a", 1.0, 1.0, ("torque",)))
+
+
+def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases():
+    config = WindowConfig().sampled(480.0)
+    assert config.every == 480.0 / config.samples and config.length == config.sample_length
+    assert WindowConfig().sampled(10.0).every == config.sample_length  # a short one is not thinned out
+    last, least, every = 12000, 350, 600.0
+    places = _spread(last, least, every)
+    assert len(places) == 20 and places.min() >= 0 and places.max() <= last
+    np.testing.assert_array_equal(places // 600, np.arange(20))
+    assert np.diff(places).min() >= least and len(np.unique(places % 600)) == 20
+    np.testing.assert_array_equal(_spread(90, 40, 200.0), [30])
+
+
+def test_windows_that_are_left_out_are_not_compared(space: Space):
+    """Those that stay are the same at a finer time step, and leave as little at the truth."""
+    config, windows = CompareConfig(channels={"position": 1.0}), replace(SHORT, every=0.8)
+    log = windowed_log(scene(), space, [swung("a", 1.0, 0.7, noise=NOISE)], config, windows)
+    assert log.unit.max() + 1 == 2 and log.unit_seconds == SHORT.length
+    gaps = np.diff(log.pieces[0].windows.begin)
+    assert gaps.min() >= SHORT.length
+    assert np.sqrt(np.mean(log.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
+    finer = log.finer(with_options(scene(), timestep=0.002), space)
+    np.testing.assert_allclose(finer.pieces[0].windows.begin, log.pieces[0].windows.begin)
+
+
+class Caught(Exception):
+    """How a log was to be made."""
+
+
+@pytest.mark.parametrize(
+    ("replay", "longest", "how"),
+    [
+        ("auto", 3.0, (False, 0.8)),
+        ("auto", 4.0, (True, None)),
+        ("whole", 3.0, (True, None)),
+        ("windows", 3.0, (False, None)),
+    ],
+)
+def test_long_motions_of_held_joints_are_sampled(
+    space: Space, monkeypatch: pytest.MonkeyPatch, replay: Any, longest: float, how: tuple[bool, float | None]
+):
+    """Of two logs of almost two seconds each; only where nothing else was asked for."""
+
+    def catch(*given: Any, whole: bool) -> None:
+        raise Caught(whole, given[4].every)
+
+    monkeypatch.setattr(log_case, "windowed_log", catch)
+    windows = WindowConfig(longest=longest, samples=5, sample_length=0.4)
+    config = DiscrepancyConfig(channels=("position",), replay=replay, windows=windows)
+    train, test = [swung("a", 1.0, 0.7), swung("b", 1.0, 0.9)], [swung("c", 1.0, 0.5)]
+    with pytest.raises(Caught) as caught:
+        log_case.windowed_case(scene(), space, library(scene(), ["joint_coulomb"]), train, test, config)
+    assert caught.value.args == (how[0], pytest.approx(how[1], rel=0.01) if how[1] else None)
 
 
 # ----- what windows leave

@@ -391,6 +391,18 @@ def test_a_first_look_begins_at_the_best_of_its_starts():
     assert objective == pytest.approx(0.5 * 40.0**2 / 17, rel=1e-4)
 
 
+def test_a_first_look_tries_what_its_settings_say():
+    seen = list[int]()
+
+    def counted(values: np.ndarray) -> np.ndarray:
+        seen.append(len(values))
+        return linear(np.ones((1, 1)), [40.0])(values)
+
+    few = RefineConfig(dampings=(1e-2, 1e1, 1e3), lengths=(1.0,), chords=1)
+    chord(counted, Space((line("a"),)), np.array([[0.0]]), np.ones((1, 1)), few)
+    assert seen == [1, few.trials] and few.trials == 6
+
+
 def test_a_trial_that_fails_is_not_taken():
     """The first full step leads from -8 to 12; beyond 9 nothing can be replayed, the optimum is at 8."""
     cliff = Recorder(lambda v: np.where(v > 9.0, np.nan, 30.0 * np.arctan(0.2 * (v - 8.0))))

@@ -114,6 +114,19 @@ def test_its_places_are_joints_with_friction_that_is_not_firm_already():
     assert has == [["j"]]
 
 
+def test_joints_that_creep_may_all_be_asked_about_together():
+    """Only those: the third is firm."""
+    body = "<body><joint name='{}' frictionloss='0.3' {}/><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>{}</body>"
+    inner = body.format("c", "solimpfriction='0.9999 0.9999'", "")
+    chain = body.format("a", "", body.format("b", "", inner))
+    motors = "".join(f"<motor joint='{j}'/>" for j in "abc")
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{chain}</worldbody><actuator>{motors}</actuator></mujoco>")
+    (effect,) = library(compile_scene(spec, "chain", joints=list("abc")), ["soft_friction"])
+    one, other = (f"friction_firmness[{j}]" for j in "ab")
+    assert effect.locations == {"a": (one,), "b": (other,), "all joints": (one, other)}
+    assert effect.natural_bounds == (one, other)
+
+
 def test_a_prescribed_motion_does_not_have_it():
     scene = held(0.03).scene
     (effect,) = library(scene, ["soft_friction"])
