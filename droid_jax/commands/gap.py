@@ -66,7 +66,7 @@ class GapCommand:
     """Commanded logs that are test data, beside others with few repeats."""
     replay: Literal["auto", "whole", "windows"] = "auto"
     """Commanded logs with few repeats. windows: replayed from measured states, each half a second long. whole: from
-    their beginnings. auto: whole where a servo holds every joint, and windows of some seconds of more than two minutes."""
+    their beginnings. auto: whole where a servo holds every joint; of more than two minutes, longer windows."""
     fit: Path | None = None
     """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
     search."""
@@ -164,7 +164,7 @@ def run(command: GapCommand) -> None:
         assert command.springs is not None  # settled
         roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)
     print("compiling the replay ...", flush=True)
-    case = case_of(split, scene, base, effects, roles, config)
+    case = case_of(split, scene, base, effects, roles, config, start)
     begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
     synthetic_robot = all(is_synthetic(r) for r in roles.values())

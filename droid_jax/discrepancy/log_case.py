@@ -224,15 +224,17 @@ def case_of(
     effects: Sequence[Effect],
     roles: Mapping[str, Recording],
     config: DiscrepancyConfig,
+    start: np.ndarray | None = None,
 ) -> Case:
     """Of recordings by role (see `preflight.search_inputs.assigned_roles`), logs where they are cut in time.
 
+    start: [F] values of the base parameters out of an earlier fit, where those of commanded logs in blocks begin.
     Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
     Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
     """
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
     if split is Split.WINDOWS:
-        return windowed_case(scene, base, effects, pooled(roles, "train"), pooled(roles, "test"), config)
+        return windowed_case(scene, base, effects, pooled(roles, "train"), pooled(roles, "test"), config, start)
     if split is not Split.BLOCKS:
         return make_case(scene, base, effects, **roles, config=config)
     config = replace(config, refine=replace(config.refine, basin_hops=0, spreads=0))  # inverse dynamics is smooth
@@ -247,6 +249,7 @@ def windowed_case(
     train: Sequence[Recording],
     test: Sequence[Recording] = (),
     config: DiscrepancyConfig | None = None,
+    start: np.ndarray | None = None,
 ) -> Case:
     """A case of pooled logs: their windows train and validate in turns, block by block.
 
@@ -260,6 +263,7 @@ def windowed_case(
             whole a number of windows is (`WindowConfig.longest`).
         test: others.
         config: of the search.
+        start: [F] values of the base parameters where its fit begins; None: the best of some draws.
 
     Raises:
         ValueError: recordings of different channels or joints, or so short that no two blocks are in each part.
@@ -284,7 +288,10 @@ def windowed_case(
     if test:
         judged = windowed_log(scene, unbounded(whole, own), test, compare, judging, effects, whole=at_once)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
-    first = _first_values(log, base, effects, end, rough)
+    if start is None:
+        first = _first_values(log, base, effects, end, rough)
+    else:
+        first = whole.embed(base, np.clip(start, base.low, base.high)[None])[0]
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
     noise = noise_of(log.about(first), base, effects, end, rough, first)
     log = log.about(noise.values)

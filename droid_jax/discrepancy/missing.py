@@ -103,7 +103,7 @@ def find_missing_effects(
         raise ValueError("effects: there is none to ask about; None asks about all of the library")
     candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
-    case = case_of(split, scene, space, asked, roles, config)
+    case = case_of(split, scene, space, asked, roles, config, start)
     for limit in case.limits:
         warnings.warn(limit, stacklevel=2)
     report = progress or (lambda stage, value: None)
@@ -126,7 +126,8 @@ def search(
         split: how the recordings share the work.
         case: with a replay cache (`Case.with_replay_cache`) the search goes on after a stop.
         fine: what `with_finer_step` made of the training recording.
-        start: [F] values of the base parameters from which their fit begins, instead of a search.
+        start: [F] values of the base parameters from which their fit begins, instead of a search; of logs in blocks the
+            case has it.
         progress: called with a stage's name and its progress value.
     """
     report = progress or (lambda stage, value: None)
@@ -135,7 +136,7 @@ def search(
         step_error = 0.0
     else:
         if split is Split.WINDOWS:
-            model = base_model(case, _begin(case, start), progress=lambda now: report("refine", now))
+            model = base_model(case, progress=lambda now: report("refine", now))
         else:
             model = base_fit(case.train, case.base, case.config, report, start)
         report("discretisation_error", None)
@@ -143,14 +144,6 @@ def search(
     verdict = search_effects(case, model, step_error, report)
     report("verdict", None)
     return verdict
-
-
-def _begin(case: Case, start: np.ndarray | None) -> np.ndarray | None:
-    """[D] a start [F] over the whole space."""
-    if start is None:
-        return None
-    inside = np.clip(start, case.base.low, case.base.high)
-    return case.full_space.embed(case.base, inside[None])[0]
 
 
 @dataclass(frozen=True, eq=False)

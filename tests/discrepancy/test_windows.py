@@ -151,6 +151,27 @@ def test_long_motions_of_held_joints_are_sampled(
     assert caught.value.args == (how[0], pytest.approx(how[1], rel=0.01) if how[1] else None)
 
 
+def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monkeypatch: pytest.MonkeyPatch):
+    """Inside of the bounds; without it at the best of some draws."""
+    begun = list[np.ndarray]()
+
+    def caught(log: WindowedLog, base: Space, effects: Any, end: float, config: Any, first: np.ndarray) -> None:
+        begun.append(log.space.select(base.names).to_search(first[log.space.columns(base)]))
+        raise Caught
+
+    monkeypatch.setattr(log_case, "noise_of", caught)
+    monkeypatch.setattr(log_case, "_first_values", lambda log, *given: log.space.mean)
+    monkeypatch.setattr(WindowedLog, "about", lambda log, values: log)
+    asked = library(scene(), ["joint_coulomb"]), [swung("a", 1.0, 0.7)]
+    found = np.array([0.2, 1.0])  # the armature may not be so large
+    config = DiscrepancyConfig(compare=CompareConfig(channels={"position": 1.0}))
+    for start in (None, found):
+        with pytest.raises(Caught):
+            log_case.windowed_case(scene(), space, *asked, (), config, start)
+    expected = [space.to_search(v) for v in (space.mean, np.array([0.2, 0.1]))]
+    np.testing.assert_allclose(begun, expected)
+
+
 # ----- what windows leave
 
 
