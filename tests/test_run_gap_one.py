@@ -164,7 +164,7 @@ def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found:
     assert found.found.split.by == "blocks" and "nothing tells a place from noise" in lines[4]
     (amplitude,) = found.found.coefficients
     assert amplitude.low < COULOMB < amplitude.high and amplitude.value == pytest.approx(COULOMB, rel=0.1)
-    assert found.found.discretisation_error == 0.0 and set(found.found.seconds) == set(IN_BLOCKS)
+    assert found.found.discretisation_error == 0.0 and set(found.found.seconds) == {"preparation", *IN_BLOCKS}
     assert found.found.trends == [] and found.found.experiments == []
     assert not any(cell.found for cell in found.found.cells.before)
     before, after = (

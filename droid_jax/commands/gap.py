@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -163,8 +164,11 @@ def run(command: GapCommand) -> None:
     if not given:
         assert command.springs is not None  # settled
         roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)
-    print("compiling the replay ...", flush=True)
+    then = "; then first fits, which tell the noise: minutes for a long log" if split is Split.WINDOWS else ""
+    print(f"compiling the replay{then} ...", flush=True)
+    began = time.monotonic()
     case = case_of(split, scene, base, effects, roles, config, start)
+    preparation = time.monotonic() - began
     begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None
     synthetic_robot = all(is_synthetic(r) for r in roles.values())
@@ -189,7 +193,14 @@ def run(command: GapCommand) -> None:
         if split is Split.WINDOWS:
             values = now.verdict.base.values, now.final.model.values
             description["open_loop"] = open_loop_errors(case, roles, *values)
-        write(out, case, now.verdict, now.final, {**description, "seconds": dict(seconds)}, now.states)
+        write(
+            out,
+            case,
+            now.verdict,
+            now.final,
+            {**description, "seconds": {"preparation": preparation, **seconds}},
+            now.states,
+        )
         written.append(now.verdict.sentence)
 
     try:
