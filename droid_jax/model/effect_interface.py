@@ -89,7 +89,7 @@ class Effect:
     special_cases:        names of effects that are special cases of it, or nearly so over the range of a motion:
                   where one of them is equivalent, this one is dominated.
     locations:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
-                  them the effect is of no interest to the search.
+                  them the effect is of no interest to the search.  A place may hold other places ("all joints").
     shape_parameters:       parameters that matter only beside an amplitude, and the values to try.
     minimum_size:     amplitude below which it is not named, in its own unit.
     natural_bounds:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may
