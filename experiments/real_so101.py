@@ -45,7 +45,7 @@ SOURCE = (
 SECONDS = 120.0
 EFFECTS = ("profile_acceleration",)
 HARD = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction
-# Of each joint in the search: a line of a parameter file, but for its name and its element.
+# Of each joint in the search: an entry of a parameter file, but for its name and its joints.
 OF_A_JOINT: dict[str, dict[str, Any]] = {
     "kp": {"std": 0.4, "low": 0.2, "high": 5.0},
     "armature": {"unit": "kg m2", "std": 0.02, "low": 0.001, "high": 0.3, "scaling": "log"},
@@ -101,11 +101,11 @@ def hard_scene(folder: Path, out: Path) -> Path:
 
 def parameters_of_joints(path: Path) -> Path:
     """The parameter file of the search."""
+    joints = [*JUDGED, "Jaw"]
     lines = [
-        {"servo" if what == "kp" else "element": joint, "name": f"{what}_{joint}", **line}
-        | ({} if what == "kp" else {"field": f"dof_{what}"})
+        {"name": what, "each": True, **line}
+        | ({"servo": joints} if what == "kp" else {"field": f"dof_{what}", "element": joints})
         for what, line in OF_A_JOINT.items()
-        for joint in (*JUDGED, "Jaw")
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps([*lines, DELAY], indent=1))

@@ -28,6 +28,10 @@ A factor on a number of the DC motor of a joint's servo: stall_torque, no_load_s
 
 A list of elements (of joints, for "servo" and "motor") or of columns makes one parameter that they share.
 
+    {"field": "dof_armature", "element": ["shoulder", "elbow"], "each": true, "name": "rotor", "std": 0.01, "high": 0.2}
+
+With "each" it makes one for each element, "rotor_shoulder" and "rotor_elbow".
+
     {"inertia": "forearm", "std": 0.1}
 
 The whole inertia of a body, ten parameters that are a possible body at every value (model/pseudo_inertia.py).
@@ -92,6 +96,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     scaling: Scaling | msgspec.UnsetType = msgspec.UNSET
     column: int | list[int] | msgspec.UnsetType = msgspec.UNSET
     nuisance: bool | msgspec.UnsetType = msgspec.UNSET
+    each: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 _KNOWN = _Entry.__struct_fields__
@@ -105,7 +110,8 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
         scene: whose elements the entries name.
 
     Returns:
-        A space of one parameter for each entry, of ten for each inertia, in the file's order.
+        A space of one parameter for each entry, of ten for each inertia, of one for each element where an entry has
+        "each", in the file's order.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -167,9 +173,8 @@ def _parameters(scene: Scene, given: Any, where: str) -> Sequence[Parameter]:
     try:
         if _INERTIA in options:
             return inertia_parameters(scene, options.pop(_INERTIA), **options)
-        if isinstance(options.get("element", options.get("servo")), list) or isinstance(options.get("column"), list):
-            return [_shared(scene, options)]
-        return [_single(scene, options)]
+        alone = _apart(options) if options.pop("each", False) else [options]
+        return [_shared(scene, one) if _several(one) else _single(scene, one) for one in alone]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 
@@ -180,6 +185,22 @@ def _needed(entry: Mapping[str, Any]) -> tuple[str, ...]:
     if "motor" in entry:
         return ("element", "std")
     return ("std", "high") if entry.get("sensor") == _TIME else _NEEDED
+
+
+def _several(options: Mapping[str, Any]) -> bool:
+    """Whether an entry names several elements or columns."""
+    return isinstance(options.get("element", options.get("servo")), list) or isinstance(options.get("column"), list)
+
+
+def _apart(options: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """An entry for each element, named after it."""
+    which = "servo" if "servo" in options else "element"
+    elements = options.get(which)
+    if not isinstance(elements, list) or not elements:
+        raise ValueError(f'"each" is of a list of elements; {which} is {elements!r}')
+    name = options.get("name")
+    named = [{} if name is None else {"name": f"{name}_{element}"} for element in cast(list[str], elements)]
+    return [{**options, which: element, **own} for element, own in zip(cast(list[str], elements), named, strict=True)]
 
 
 def _shared(scene: Scene, options: Mapping[str, Any]) -> Parameter:
