@@ -181,17 +181,16 @@ def test_a_list_of_joints_makes_one_parameter_that_they_share(tmp_path: Path):
 
 def test_a_parameter_of_each_is_what_entries_of_their_own_make(tmp_path: Path):
     """Also of each joint's columns together, and of sensors, which have names of their own."""
-    scene, both = compile_scene(mujoco.MjSpec.from_string(TWO), "arm"), ["elbow", "wrist"]
+    limited = TWO.replace('kp="8"', 'kp="8" forcerange="-1 1"')
+    scene, both = compile_scene(mujoco.MjSpec.from_string(limited), "arm"), ["elbow", "wrist"]
     entries = (
         ({"field": "dof_damping", "std": 0.1, "high": 9.0, "unit": "N m s/rad"}, "element", "oil"),
-        ({"field": "actuator_biasprm", "column": [1, 2], "std": 0.1, "high": 9.0, "mode": "scale"}, "element", "bias"),
+        ({"field": "actuator_forcerange", "column": [0, 1], "std": 0.1, "high": 9.0, "mode": "scale"}, "element", "l"),
         ({"servo": "", "std": 0.1}, "servo", "gain"),
         ({"motor": "stall_torque", "std": 0.1}, "element", "stall"),
         ({"sensor": "coulomb", "std": 0.1, "high": 1.0}, "element", ""),
     )
     for entry, key, name in entries:
-        if "motor" in entry:  # it needs limits of both
-            scene = compile_scene(mujoco.MjSpec.from_string(TWO.replace('kp="8"', 'kp="8" forcerange="-1 1"')), "arm")
         together = {**entry, key: both, "each": True, **({"name": name} if name else {})}
         apart = [{**entry, key: j, **({"name": f"{name}_{j}"} if name else {})} for j in both]
         expected = [loaded(tmp_path, scene, one).parameters[0] for one in apart]
