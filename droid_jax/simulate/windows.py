@@ -37,7 +37,7 @@ class WindowConfig:
     every: s, in each of which one window lies, at a place that differs; None: none is left out.
     longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them
     samples: windows or so are replayed instead, spread over them,
-    sample_length, sample_lead: s, of each: long enough for a joint that creeps to be seen.
+    sample_length, sample_lead: s, of each.
     """
 
     length: float = 0.5
