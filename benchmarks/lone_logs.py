@@ -41,7 +41,7 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
     score_test,
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step, with_step_difference  # noqa: E402
 from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
@@ -282,7 +282,9 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             "screened": time.monotonic() - began,
         }
         main = [p.name for p in bench.base.parameters if not p.nuisance]
+        case = replace(case, train=with_step_difference(case.train, model, with_finer_step(case.train, case.base, log)))
         stated = intervals(case.train, model, main)  # 90 %
+        result["stepped"] = time.monotonic() - began
         result["held"] = {name: low <= truth[name] <= high for name, (low, high) in stated.items()}
         if not model.refined.converged:
             return {**result, "verdict": "fit not converged", "effects": [], "seconds": time.monotonic() - began}
@@ -290,8 +292,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             return {**result, "verdict": "none", "effects": [], "seconds": time.monotonic() - began} | _judged(
                 bench, hidden, {"verdict": "none"}
             )
-        step_error = discretisation_error(case.train, model, with_finer_step(case.train, case.base, log))
-        verdict = search_effects(case, model, step_error)
+        verdict = search_effects(case, model, discretisation_error(case.train, model))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": time.monotonic() - began}
     result |= {

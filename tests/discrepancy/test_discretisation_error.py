@@ -11,7 +11,15 @@ import pytest
 from small_gap import Small, small
 
 from droid_jax.discrepancy import fitting
-from droid_jax.discrepancy.fitting import beyond_step_error, discretisation_error, with_finer_step
+from droid_jax.discrepancy.case import ResidualSet
+from droid_jax.discrepancy.fitting import (
+    beyond_step_error,
+    discretisation_error,
+    fit_posterior,
+    step_shift,
+    with_finer_step,
+    with_step_difference,
+)
 from droid_jax.identify.search import NotReplayed
 
 
@@ -20,12 +28,17 @@ def found() -> Small:
     return small()
 
 
-def of(found: Small, difference: np.ndarray) -> float:
-    """U0 where the finer simulation differs by [M] of the noise of the repeats' mean."""
+def stepped(found: Small, difference: np.ndarray) -> ResidualSet:
+    """The training recording where the finer simulation differs by [M] of the noise of the repeats' mean."""
     case, base = found.case, found.base
     coarse = case.train.whitened(base.values[None])
     fine: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
-    return discretisation_error(case.train, base, fine)
+    return with_step_difference(case.train, base, fine)
+
+
+def of(found: Small, difference: np.ndarray) -> float:
+    """U0 of such a simulation."""
+    return discretisation_error(stepped(found, difference), found.base)
 
 
 def test_what_no_base_parameter_can_do_is_the_error(found: Small):
@@ -60,7 +73,20 @@ def test_inverse_dynamics_has_no_time_step(found: Small):
     inverse = replace(train, cost=replace(train.cost, drives=measured))
     fine = with_finer_step(inverse, found.base.space, found.recordings["train"])
     assert fine is None
-    assert discretisation_error(inverse, found.base, fine) == 0.0
+    inverse = with_step_difference(inverse, found.base, fine)
+    assert discretisation_error(inverse, found.base) == 0.0
+    assert not step_shift(inverse, found.base.refined).any()
+
+
+def test_an_interval_reaches_to_where_a_finer_step_would_move_the_fit(found: Small):
+    """Four thirds of what a quarter of the step shows, of a parameter that the recording tells well."""
+    refined, train = found.base.refined, found.case.train
+    k = int(np.argmax(np.where(refined.free, np.linalg.norm(refined.jacobian, axis=0), 0.0)))
+    known = stepped(found, -0.5 * refined.jacobian[:, k])
+    shift = step_shift(known, refined)
+    assert shift[k] == pytest.approx(-4 / 3 * 0.5, rel=0.05)
+    plain, wide = (np.diag(fit_posterior(of, found.base).cov) for of in (train, known))
+    assert wide == pytest.approx(plain + shift**2, rel=1e-9)
 
 
 def test_an_error_of_first_order_may_be_nearly_twice_what_a_quarter_of_the_step_shows():
