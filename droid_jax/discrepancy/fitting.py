@@ -20,8 +20,8 @@ from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.identifiability import posterior_of
-from droid_jax.identify.levenberg_marquardt import curvature, principal_axes
+from droid_jax.identify.identifiability import moved_by_step, posterior_of, step_shift
+from droid_jax.identify.levenberg_marquardt import principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
@@ -259,27 +259,21 @@ def final_refit(
 
 
 def fit_posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
-    """What the fitted recording says of a model's parameters, over its space (`posterior_of`).
-
-    As uncertain as the time step makes them, too, where what it does has been measured (`with_step_difference`): the
-    fit of an arm of three joints at 5 ms has its dampings 1 % too low, and its deviations are a tenth of that.
-    """
+    """What the fitted recording says of a model's parameters, over its space (`posterior_of`), its time step's part
+    among it where that was measured (`with_step_difference`)."""
     told = posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
-    shift = step_shift(residual_set, model.refined)
-    return replace(told, cov=told.cov + np.outer(shift, shift))
+    return with_step_moves(residual_set, model, told)
 
 
-def step_shift(residual_set: ResidualSet, refined: Refined) -> np.ndarray:
-    """[D] how far a vanishing time step would move a fit, search units; zero where that was not measured.
+def with_step_moves(residual_set: ResidualSet, model: FittedModel, gaussian: Gaussian) -> Gaussian:
+    """A model's Gaussian, as uncertain as the time step makes it (`moved_by_step`).
 
     An error of first order is `FINER` / (`FINER` - 1) times what a quarter of the step changes.
     """
     if residual_set.step_difference is None:
-        return np.zeros(len(refined.space))
-    off = residual_set.step_difference * np.sqrt(residual_set.repeats)
-    fitted = refined.jacobian[: len(off)]  # a final fit has the validation recording's rows too
-    shift = np.linalg.solve(curvature(fitted, refined.prior), fitted.T @ off)
-    return FINER / (FINER - 1) * np.where(refined.free, shift, 0.0)
+        return gaussian
+    off = FINER / (FINER - 1) * np.sqrt(residual_set.repeats) * residual_set.step_difference
+    return moved_by_step(gaussian, step_shift(model.refined, off))
 
 
 def consistent_with_zero(residual_set: ResidualSet, model: FittedModel, part: Candidate) -> bool:

@@ -7,7 +7,7 @@ docs/results-folder.md lists every entry.  No pickle.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case, ResidualSet
-from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals, step_shift
+from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals, with_step_moves
 from droid_jax.discrepancy.maps import Localisation
 from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
@@ -38,8 +38,7 @@ def extended(case: Case, final: FinalModel) -> Extended:
         [c for fitted in final.fitted_to for c in fitted.cost.comparisons],
         case.config.identifiability,
     )
-    shift = step_shift(case.train, model.refined)
-    gaussian = replace(gaussian, cov=gaussian.cov + np.outer(shift, shift))
+    gaussian = with_step_moves(case.train, model, gaussian)
     named = {part.effect for part in model.parts}
     effects = tuple(e for e in case.effects if e.name in named)
     return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)
