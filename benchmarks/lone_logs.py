@@ -271,6 +271,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
         result["prepared"] = time.monotonic() - began
         model = base_model(case)
         result["fitted"] = time.monotonic() - began
+        case = replace(case, train=with_step_difference(case.train, model, with_finer_step(case.train, case.base, log)))
         screen = score_test(case.train, model, directions_of(candidates(case.effects)), config.seed)
         result |= {
             "p": screen.p,
@@ -282,9 +283,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             "screened": time.monotonic() - began,
         }
         main = [p.name for p in bench.base.parameters if not p.nuisance]
-        case = replace(case, train=with_step_difference(case.train, model, with_finer_step(case.train, case.base, log)))
         stated = intervals(case.train, model, main)  # 90 %
-        result["stepped"] = time.monotonic() - began
         result["held"] = {name: low <= truth[name] <= high for name, (low, high) in stated.items()}
         if not model.refined.converged:
             return {**result, "verdict": "fit not converged", "effects": [], "seconds": time.monotonic() - began}

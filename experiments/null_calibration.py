@@ -99,6 +99,7 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
     recordings = found[2]
     case = watch("prepare", lambda: bench.case(scene, {"train": recordings["train"]}))
     model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
+    case = watch("discretisation_error", lambda: bench.with_step(scene, case, model, recordings["train"]))
     screen = watch("screen", lambda: score_test(case.train, model, directions_of(candidates(case.effects))))
     best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.key
     yield {
@@ -108,7 +109,6 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
         "best": str(best),
     }
     if screen.p < case.config.selection.significance:
-        case = watch("discretisation_error", lambda: bench.with_step(scene, case, model, recordings["train"]))
         step_error = discretisation_error(case.train, model)
         whole = replace(watch("prepare", lambda: bench.case(scene, recordings)), train=case.train)
         verdict = watch("find", lambda: search_effects(whole, model, step_error))

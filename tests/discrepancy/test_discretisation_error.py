@@ -11,6 +11,7 @@ import pytest
 from small_gap import Small, small
 
 from droid_jax.discrepancy import fitting
+from droid_jax.discrepancy.candidates import directions_of, score_test
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.fitting import (
     beyond_step_error,
@@ -21,6 +22,7 @@ from droid_jax.discrepancy.fitting import (
     with_step_moves,
 )
 from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import candidates
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +94,15 @@ def test_an_error_of_first_order_may_be_nearly_twice_what_a_quarter_of_the_step_
     """U of such an error is square in the step, of which three quarters are seen: 16/9 of U0."""
     assert not beyond_step_error(16 / 9 * 0.1, 0.1) and beyond_step_error(16 / 9 * 0.1 + 1e-6, 0.1)
     assert beyond_step_error(1e-9, 0.0) and not beyond_step_error(0.0, 0.0)
+
+
+def test_the_score_test_takes_off_what_the_time_step_does(found: Small):
+    """A residual that is all the step's is none, whatever effect looks like it; half of it is left by half a step."""
+    base, asked = found.base, directions_of(candidates(found.case.effects))
+    common = base.residuals.mean(axis=0)
+    plain = score_test(found.case.train, base, asked)
+    assert plain.p < 0.01
+    halved = score_test(replace(found.case.train, step_difference=0.5 * common), base, asked)
+    assert halved.size == pytest.approx(0.5 * plain.size, rel=0.1, abs=1e-3)
+    whole = score_test(replace(found.case.train, step_difference=common), base, asked)
+    assert whole.p > 0.1 and np.abs(whole.size).max() < 0.1 * np.abs(plain.size).max()
