@@ -134,7 +134,7 @@ def step_shift(refined: Refined, off: np.ndarray) -> np.ndarray:
 def moved_by_step(gaussian: Gaussian, shift: np.ndarray) -> Gaussian:
     """A Gaussian that is as uncertain as its time step makes it; shift: [D] of `step_shift`.
 
-    An arm of three joints that was fitted at 5 ms has its dampings 1 % too low, ten times what noise leaves open.
+    An arm of three joints that was fitted at 5 ms has its dampings 1 % too low, three to four of its own deviations.
     """
     if not shift.any():
         return gaussian
