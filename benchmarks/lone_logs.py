@@ -41,7 +41,7 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
     score_test,
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step, with_step_difference  # noqa: E402
 from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
@@ -271,6 +271,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
         result["prepared"] = time.monotonic() - began
         model = base_model(case)
         result["fitted"] = time.monotonic() - began
+        case = replace(case, train=with_step_difference(case.train, model, with_finer_step(case.train, case.base, log)))
         screen = score_test(case.train, model, directions_of(candidates(case.effects)), config.seed)
         result |= {
             "p": screen.p,
@@ -290,8 +291,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
             return {**result, "verdict": "none", "effects": [], "seconds": time.monotonic() - began} | _judged(
                 bench, hidden, {"verdict": "none"}
             )
-        step_error = discretisation_error(case.train, model, with_finer_step(case.train, case.base, log))
-        verdict = search_effects(case, model, step_error)
+        verdict = search_effects(case, model, discretisation_error(case.train, model))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": time.monotonic() - began}
     result |= {

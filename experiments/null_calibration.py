@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from benchmarks.common import CODE, origin, stem  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.discrepancy.candidates import directions_of, score_test  # noqa: E402
 from droid_jax.discrepancy.config import SelectionConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import base_fit  # noqa: E402
+from droid_jax.discrepancy.fitting import base_fit, discretisation_error  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
 from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -99,6 +99,7 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
     recordings = found[2]
     case = watch("prepare", lambda: bench.case(scene, {"train": recordings["train"]}))
     model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
+    case = watch("discretisation_error", lambda: bench.with_step(scene, case, model, recordings["train"]))
     screen = watch("screen", lambda: score_test(case.train, model, directions_of(candidates(case.effects))))
     best = screen.directions[int(np.argmax(np.abs(screen.t)))].candidate.key
     yield {
@@ -108,8 +109,8 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
         "best": str(best),
     }
     if screen.p < case.config.selection.significance:
-        step_error = watch("discretisation_error", lambda: bench.step_error(scene, case, model, recordings["train"]))
-        whole = watch("prepare", lambda: bench.case(scene, recordings))
+        step_error = discretisation_error(case.train, model)
+        whole = replace(watch("prepare", lambda: bench.case(scene, recordings)), train=case.train)
         verdict = watch("find", lambda: search_effects(whole, model, step_error))
         yield {
             "discretisation_error": step_error,

@@ -76,7 +76,7 @@ def searched(
         clock(names[0], None)
         case = case.with_replay_cache(checkpoints / "replays")
         fine = with_finer_step(case.train, case.base, roles["train"])
-        verdict = search(split, case, fine, start, clock)
+        case, verdict = search(split, case, fine, start, clock)
         for now in amended(case, verdict, roles["train"], clock):
             clock.stop()
             keep(case, now, clock.seconds)

@@ -156,6 +156,9 @@ def score_test(
     """Score directions against a model's residuals on the recording it was fitted to.
 
     A base parameter at a bound absorbs nothing more: sensitivities keep what it would have taken.
+
+    What the simulation's own time step does to the residuals, where that was measured, is taken off first: it is the
+    same in every repeat or block, and no flip would tell it from an effect.
     """
     root, free = residual_set.repeats**0.5, model.refined.free
     base, prior = model.refined.jacobian[:, free] / root, model.refined.prior[free] * root * residual_set.prior_slack
@@ -163,10 +166,11 @@ def score_test(
     blown_up = np.isnan(raw).any(axis=1)
     raw[blown_up] = 0.0
     projected = project(raw, base, prior)
-    rows = residual_set.resampling
-    found = scored(
-        model.residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, base, prior, seed)
-    )
+    rows, residuals = residual_set.resampling, model.residuals
+    if residual_set.step_difference is not None:
+        step = project(residual_set.step_difference[None], base, model.refined.prior[free] * root)[0]
+        residuals = rows.residuals(residuals.mean(axis=0) - step)
+    found = scored(residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, base, prior, seed))
     failed = tuple(dict.fromkeys(directions[k].candidate.key for k in np.flatnonzero(blown_up).tolist()))
     return replace(found, failed=failed)
 

@@ -38,6 +38,7 @@ class ResidualSet:
     column, time: [M] compared column and instant [s] of each residual.
     config, identifiability: thresholds of the search.
     equivalence_factor, prior_slack: those of the config that go with the resampling.
+    step_difference: [M] what a quarter of the time step changes, in one repeat's noise; None: not measured.
     nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(nuisances)] what one
     prior deviation of each adds to the common residual.  See `with_nuisances`.
     """
@@ -52,6 +53,7 @@ class ResidualSet:
     identifiability: IdentifiabilityConfig
     equivalence_factor: float
     prior_slack: float
+    step_difference: np.ndarray | None = field(default=None, kw_only=True)
     nuisances: tuple[str, ...] = field(default=(), kw_only=True)
     nuisance_columns: np.ndarray | None = field(default=None, kw_only=True)
 

@@ -20,7 +20,7 @@ from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.identifiability import posterior_of
+from droid_jax.identify.identifiability import moved_by_step, posterior_of, step_shift
 from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, principal_axes
 from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
 from droid_jax.identify.pipeline import Progress
@@ -261,8 +261,21 @@ def final_refit(
 
 
 def fit_posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
-    """What the fitted recording says of a model's parameters, over its space (`posterior_of`)."""
-    return posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
+    """What the fitted recording says of a model's parameters, over its space (`posterior_of`), its time step's part
+    among it where that was measured (`with_step_difference`)."""
+    told = posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
+    return with_step_moves(residual_set, model, told)
+
+
+def with_step_moves(residual_set: ResidualSet, model: FittedModel, gaussian: Gaussian) -> Gaussian:
+    """A model's Gaussian, as uncertain as the time step makes it (`moved_by_step`).
+
+    An error of first order is `FINER` / (`FINER` - 1) times what a quarter of the step changes.
+    """
+    if residual_set.step_difference is None:
+        return gaussian
+    off = FINER / (FINER - 1) * np.sqrt(residual_set.repeats) * residual_set.step_difference
+    return moved_by_step(gaussian, step_shift(model.refined, off))
 
 
 def consistent_with_zero(residual_set: ResidualSet, model: FittedModel, part: Candidate) -> bool:
@@ -321,42 +334,43 @@ def _finer(scene: Scene) -> Scene:
     return with_options(scene, timestep=float(scene.model.opt.timestep) / FINER)
 
 
-def discretisation_error(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> float:
-    """U0, the U that the simulation's own time step leaves; zero in inverse mode.
-
-    The base model is replayed at a quarter of the time step and taken for data.  What the base parameters cannot absorb
-    of the difference would be called a discrepancy though nothing is missing.
+def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> ResidualSet:
+    """The same residual set, knowing what a quarter of the time step changes.
 
     Args:
         residual_set: of the recording that the model was fitted to.
         model: the base model.
-        fine: what `with_finer_step` made of the same recording.
+        fine: what `with_finer_step` made of the same recording; None leaves the set as it is.
 
     Raises:
         NotReplayed: the finer replay blows up.
     """
-    off = step_difference(residual_set, model, fine)
-    if off is None:
-        return 0.0
-    count = residual_set.repeats
-    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
-    return float(left @ left / residual_set.resampling.counted.sum())
-
-
-def step_difference(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> np.ndarray | None:
-    """[M] what a quarter of the time step changes, in one repeat's noise; None in inverse mode.
-
-    Arguments and errors as of `discretisation_error`.
-    """
     if fine is None:
-        return None
+        return residual_set
     values = model.values[residual_set.cost.space.columns(model.space)]
     coarse = residual_set.whitened(model.values[None])[0]
     off = (fine.whitened(values[None])[0] - coarse).astype(np.float64) / np.sqrt(residual_set.repeats)
     if not np.isfinite(off).all():
         name = residual_set.comparison.name
         raise NotReplayed(f"the simulation of {name!r} blows up at a quarter of its time step")
-    return off
+    return replace(residual_set, step_difference=off)
+
+
+def discretisation_error(residual_set: ResidualSet, model: FittedModel) -> float:
+    """U0, the U that the simulation's own time step leaves; zero where no finer step was measured.
+
+    The base model is replayed at a quarter of the time step and taken for data.  What the base parameters cannot absorb
+    of the difference would be called a discrepancy though nothing is missing.
+
+    Args:
+        residual_set: of the recording that the model was fitted to (`with_step_difference`).
+        model: the base model.
+    """
+    if residual_set.step_difference is None:
+        return 0.0
+    off, count = residual_set.step_difference, residual_set.repeats
+    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
+    return float(left @ left / residual_set.resampling.counted.sum())
 
 
 def beyond_step_error(discrepancy: float, discretisation_error: float) -> bool:

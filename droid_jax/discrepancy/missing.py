@@ -29,6 +29,7 @@ from droid_jax.discrepancy.fitting import (
     final_refit,
     final_refit_due,
     with_finer_step,
+    with_step_difference,
 )
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.discrepancy.results import extended
@@ -108,7 +109,7 @@ def find_missing_effects(
         warnings.warn(limit, stacklevel=2)
     report = progress or (lambda stage, value: None)
     fine = with_finer_step(case.train, case.base, roles["train"])
-    verdict = search(split, case, fine, start, report)
+    case, verdict = search(split, case, fine, start, report)
     *_, whole = amended(case, verdict, roles["train"], report)
     return whole.verdict, extended(case, whole.final)
 
@@ -119,8 +120,10 @@ def search(
     fine: Cost | None,
     start: np.ndarray | None = None,
     progress: Progress | None = None,
-) -> Verdict:
+) -> tuple[Case, Verdict]:
     """The verdict on a case of recordings by role (see `case_of`), without its amendments (see `amended`).
+
+    The case is returned with what the time step does to its training recording, which is in the intervals.
 
     Args:
         split: how the recordings share the work.
@@ -133,17 +136,16 @@ def search(
     report = progress or (lambda stage, value: None)
     if split is Split.BLOCKS:
         model = base_model(case, progress=lambda now: report("refine", now))
-        step_error = 0.0
     else:
         if split is Split.WINDOWS:
             model = base_model(case, progress=lambda now: report("refine", now))
         else:
             model = base_fit(case.train, case.base, case.config, report, start)
         report("discretisation_error", None)
-        step_error = discretisation_error(case.train, model, fine)
-    verdict = search_effects(case, model, step_error, report)
+        case = replace(case, train=with_step_difference(case.train, model, fine))
+    verdict = search_effects(case, model, discretisation_error(case.train, model), report)
     report("verdict", None)
-    return verdict
+    return case, verdict
 
 
 @dataclass(frozen=True, eq=False)

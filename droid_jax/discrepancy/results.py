@@ -15,7 +15,7 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case, ResidualSet
-from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals
+from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals, with_step_moves
 from droid_jax.discrepancy.maps import Localisation
 from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
@@ -38,6 +38,7 @@ def extended(case: Case, final: FinalModel) -> Extended:
         [c for fitted in final.fitted_to for c in fitted.cost.comparisons],
         case.config.identifiability,
     )
+    gaussian = with_step_moves(case.train, model, gaussian)
     named = {part.effect for part in model.parts}
     effects = tuple(e for e in case.effects if e.name in named)
     return Extended(case.train.cost.scene, model.parts, effects, values, gaussian)

@@ -24,8 +24,10 @@ from droid_jax.identify.identifiability import (
     Identifiability,
     IdentifiabilityConfig,
     identifiability,
+    moved_by_step,
     not_judged,
     posterior,
+    step_shift,
 )
 from droid_jax.identify.multistart import RefineConfig, Refined, refine
 from droid_jax.identify.search import CmaConfig, cma_search
@@ -323,7 +325,11 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     checks = {}
     if config.checks:  # the other engine is compiled for the comparison only where this one was asked for
         engine, compiles = problem.engine.engine, config.engine != "auto"
-        checks = check_solution(base, problem.recordings, best, engine, problem.effects, compiles or engine == "mjx")
+        checks, off = check_solution(
+            base, problem.recordings, best, engine, problem.effects, compiles or engine == "mjx"
+        )
+        if refined is not None:
+            full_gaussian = moved_by_step(full_gaussian, step_shift(refined, off))
     seconds["checks"] = time.monotonic() - began
     names = [r.name for r in problem.recordings]
     return Identified(

@@ -79,8 +79,10 @@ def check_solution(
     engine: str,
     effects: Sequence[Effect] = (),
     compiles: bool = True,
-) -> dict[str, SolutionCheck]:
-    """The checks by recording name, of all recordings with commands; MJX is compiled once more at most.
+) -> tuple[dict[str, SolutionCheck], np.ndarray]:
+    """The checks by recording name, of all recordings with commands, and what the time step does.
+
+    MJX is compiled once more at most.
 
     Args:
         cost: the fitted one, over the recordings.
@@ -91,18 +93,23 @@ def check_solution(
         compiles: whether MJX may be compiled; without, a fit in plain C is not compared with it.
 
     Returns:
-        Nothing of logs without commands.
+        No checks of logs without commands; and [M] what a vanishing time step would change of the cost's residuals, as
+        far as was measured, zero elsewhere.
     """
     found, compiled = dict[str, SolutionCheck](), not compiles
     rollouts = cost.rollouts(best[None])
+    limits = list(rollouts)
     parts = zip(cost.comparisons, cost.drives, recordings, rollouts, strict=True)
-    for comparison, drive, recording, rollout in parts:
+    for number, (comparison, drive, recording, rollout) in enumerate(parts):
         if isinstance(drive, Drive):
             own = jax.tree.map(lambda a: a[0], rollout)
             replayed = _Replayed(cost, comparison, drive, recording, best, tuple(effects), own)
-            found[comparison.name], again = replayed.checked(engine, may_compile=not compiled)
+            found[comparison.name], limit, again = replayed.checked(engine, may_compile=not compiled)
             compiled = compiled or again
-    return found
+            if limit is not None:
+                limits[number] = jax.tree.map(lambda a: np.asarray(a)[None], limit)
+    off = cost.whitened_of(limits)[0].astype(np.float64) - cost.whitened_of(rollouts)[0]
+    return found, np.where(np.isfinite(off), off, 0.0)
 
 
 def solution_notes(found: Mapping[str, SolutionCheck], scene: str) -> list[str]:
@@ -153,32 +160,38 @@ class _Replayed:
     effects: tuple[Effect, ...]
     rollout: Rollout
 
-    def checked(self, engine: str, may_compile: bool) -> tuple[SolutionCheck, bool]:
-        """The checks, and whether they took a compilation."""
+    def checked(self, engine: str, may_compile: bool) -> tuple[SolutionCheck, Rollout | None, bool]:
+        """The checks, the replay as its time step goes to zero or None, and whether they took a compilation."""
         mj_step, channel = self.comparison.config.mj_step, self.comparison.leading
         left = max(
             _rms(self._filtered(self.rollout) - channel.noise.mean),
             self.comparison.config.noise.minimum[channel.name],
         )
         unit = unit_of(self.cost.scene, channel)
-        check = SolutionCheck(unit, self.drive.timestep, left, channel=channel.name)
+        check, limit = SolutionCheck(unit, self.drive.timestep, left, channel=channel.name), None
         if engine == "mujoco":
             if not mj_step:
-                check = self._with_step(check, self._in_c(2))
+                check, limit = self._with_step(check, self._in_c(2))
             if may_compile:
                 check = self._with_parity(check, self._in_mjx(1, mj_step))
-            return check, may_compile
-        check = self._with_parity(check, self._in_c(1) if mj_step else self._converged_c())
+            return check, limit, may_compile
+        other = self._in_c(1) if mj_step else self._converged_c()
+        check = self._with_parity(check, other)
         if mj_step:  # the data were made with this very step
-            return check, False
+            return check, None, False
         if check.parity_rms is not None and check.parity_rms <= LARGE * check.remaining:
-            return replace(check, discretisation=check.parity_rms), False
-        return (self._with_step(check, self._in_mjx(2)) if may_compile else check), may_compile
+            assert not isinstance(other, str)
+            return replace(check, discretisation=check.parity_rms), other, False
+        if may_compile:
+            check, limit = self._with_step(check, self._in_mjx(2))
+        return check, limit, may_compile
 
-    def _with_step(self, check: SolutionCheck, half: Rollout | str) -> SolutionCheck:
+    def _with_step(self, check: SolutionCheck, half: Rollout | str) -> tuple[SolutionCheck, Rollout | None]:
+        """The check with the time step's part, and the replay without one: its error is of first order."""
         if isinstance(half, str):
-            return replace(check, unmeasured="; ".join(filter(None, (check.unmeasured, half))))
-        return replace(check, discretisation=_rms(self._filtered(half) - self._filtered(self.rollout)))
+            return replace(check, unmeasured="; ".join(filter(None, (check.unmeasured, half)))), None
+        check = replace(check, discretisation=_rms(self._filtered(half) - self._filtered(self.rollout)))
+        return check, _limit(half, self.rollout)
 
     def _with_parity(self, check: SolutionCheck, other: Rollout | str) -> SolutionCheck:
         if isinstance(other, str):
@@ -221,9 +234,7 @@ class _Replayed:
         if isinstance(fine, str) or times == 1:
             return fine
         coarse = self._in_c(times // 2)
-        if isinstance(coarse, str):
-            return coarse
-        return jax.tree.map(lambda a, b: a if a.dtype == bool else 2 * a - b, fine, coarse)
+        return coarse if isinstance(coarse, str) else _limit(fine, coarse)
 
     def _in_c(self, times: int) -> Rollout | str:
         """The replay in plain C with a finer time step, at the rows of the own one; or why there is none."""
@@ -251,6 +262,11 @@ class _Replayed:
             return np.concatenate([kept, np.repeat(kept[-1:], missing, axis=0)]) if missing else kept
 
         return jax.tree.map(own, rollout)
+
+
+def _limit(half: Rollout, whole: Rollout) -> Rollout:
+    """A replay as its time step goes to zero, from two of which one has half the other's."""
+    return jax.tree.map(lambda a, b: a if a.dtype == bool else 2 * np.asarray(a) - np.asarray(b), half, whole)
 
 
 def _finer(rows: int) -> int:

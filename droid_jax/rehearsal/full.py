@@ -324,7 +324,7 @@ def _rehearse(of: FullRehearsal, case: HiddenCase, replays: Path) -> dict[str, A
     config = replace(of.config, channels=of.channels)
     cased = case_of(split, scene, of.space, effects, roles, config)
     fine = with_finer_step(cased.train, cased.base, roles["train"])
-    verdict = search(split, cased.with_replay_cache(replays), fine)
+    _, verdict = search(split, cased.with_replay_cache(replays), fine)
     named = [str(k) for k in verdict.effects]
     ties = [[[str(k) for k in keys] for keys in each] for each in verdict.indistinguishable]
     right = f"{case.effect} at {case.location}"

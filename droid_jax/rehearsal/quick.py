@@ -19,7 +19,7 @@ from droid_jax.cost.channels import SIMULATED
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, refit, step_difference, with_finer_step
+from droid_jax.discrepancy.fitting import FittedModel, refit, with_finer_step, with_step_difference
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
@@ -127,7 +127,7 @@ def rehearsed(
         clock("step error")
         with contextlib.suppress(NotReplayed):
             fine = with_finer_step(case.train, case.base, roles["train"])
-            train = replace(train, step=step_difference(case.train, base, fine))
+            train = replace(train, step=with_step_difference(case.train, base, fine).step_difference)
     clock("")
     model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)

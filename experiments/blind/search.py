@@ -16,7 +16,14 @@ from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.cost.cost import Cost
 from droid_jax.discrepancy.case import Case, ResidualSet, make_case, residual_set
-from droid_jax.discrepancy.fitting import FittedModel, base_fit, discretisation_error, intervals, with_finer_step
+from droid_jax.discrepancy.fitting import (
+    FittedModel,
+    base_fit,
+    discretisation_error,
+    intervals,
+    with_finer_step,
+    with_step_difference,
+)
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effects.candidate import names_of
@@ -60,12 +67,12 @@ class Bench:
         kept = {e.name for e in where.effects(without)}
         return replace(known, **of, effects=tuple(e for e in known.effects if e.name in kept))
 
-    def step_error(self, scene: str, case: Case, model: FittedModel, recording: Recording) -> float:
-        """U0 of a base model; the finer replay is compiled once a scene."""
+    def with_step(self, scene: str, case: Case, model: FittedModel, recording: Recording) -> Case:
+        """The case that knows what its time step does; the finer replay is compiled once a scene."""
         if scene not in self.fine:
             self.fine[scene] = with_finer_step(case.train, model.space, recording)
         fine = self.fine[scene]
-        return discretisation_error(case.train, model, fine and fine.against([recording]))
+        return replace(case, train=with_step_difference(case.train, model, fine and fine.against([recording])))
 
 
 def _again(known: ResidualSet, recording: Recording) -> ResidualSet:
@@ -97,10 +104,8 @@ def search_case(folder: Path, bench: Bench) -> dict[str, Any]:
     try:
         case = watch("prepare", lambda: bench.case(told["scene"], recordings, told["without"]))
         model = watch("base", lambda: base_fit(case.train, case.base, case.config, silent))
-        step_error = watch(
-            "discretisation_error", lambda: bench.step_error(told["scene"], case, model, recordings["train"])
-        )
-        verdict = watch("find", lambda: search_effects(case, model, step_error))
+        case = watch("discretisation_error", lambda: bench.with_step(told["scene"], case, model, recordings["train"]))
+        verdict = watch("find", lambda: search_effects(case, model, discretisation_error(case.train, model)))
     except FAILED as error:
         return {**result, "verdict": "error", "error": str(error), "seconds": watch.seconds}
     result |= describe(case, verdict)

@@ -11,8 +11,18 @@ import pytest
 from small_gap import Small, small
 
 from droid_jax.discrepancy import fitting
-from droid_jax.discrepancy.fitting import beyond_step_error, discretisation_error, with_finer_step
+from droid_jax.discrepancy.candidates import directions_of, score_test
+from droid_jax.discrepancy.case import ResidualSet
+from droid_jax.discrepancy.fitting import (
+    beyond_step_error,
+    discretisation_error,
+    fit_posterior,
+    with_finer_step,
+    with_step_difference,
+    with_step_moves,
+)
 from droid_jax.identify.search import NotReplayed
+from droid_jax.model.effects.candidate import candidates
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +30,17 @@ def found() -> Small:
     return small()
 
 
-def of(found: Small, difference: np.ndarray) -> float:
-    """U0 where the finer simulation differs by [M] of the noise of the repeats' mean."""
+def stepped(found: Small, difference: np.ndarray) -> ResidualSet:
+    """The training recording where the finer simulation differs by [M] of the noise of the repeats' mean."""
     case, base = found.case, found.base
     coarse = case.train.whitened(base.values[None])
     fine: Any = SimpleNamespace(whitened=lambda rows: coarse + difference[None])
-    return discretisation_error(case.train, base, fine)
+    return with_step_difference(case.train, base, fine)
+
+
+def of(found: Small, difference: np.ndarray) -> float:
+    """U0 of such a simulation."""
+    return discretisation_error(stepped(found, difference), found.base)
 
 
 def test_what_no_base_parameter_can_do_is_the_error(found: Small):
@@ -60,10 +75,34 @@ def test_inverse_dynamics_has_no_time_step(found: Small):
     inverse = replace(train, cost=replace(train.cost, drives=measured))
     fine = with_finer_step(inverse, found.base.space, found.recordings["train"])
     assert fine is None
-    assert discretisation_error(inverse, found.base, fine) == 0.0
+    inverse = with_step_difference(inverse, found.base, fine)
+    assert discretisation_error(inverse, found.base) == 0.0
+    plain = fit_posterior(found.case.train, found.base)
+    assert with_step_moves(inverse, found.base, plain) is plain
+
+
+def test_an_interval_reaches_to_where_a_finer_step_would_move_the_fit(found: Small):
+    """Four thirds of what a quarter of the step shows, of a parameter that the recording tells well."""
+    refined, train = found.base.refined, found.case.train
+    k = int(np.argmax(np.where(refined.free, np.linalg.norm(refined.jacobian, axis=0), 0.0)))
+    known = stepped(found, -0.5 * refined.jacobian[:, k])
+    plain, wide = (np.diag(fit_posterior(of, found.base).cov) for of in (train, known))
+    assert np.sqrt(wide - plain)[k] == pytest.approx(4 / 3 * 0.5, rel=0.05)
 
 
 def test_an_error_of_first_order_may_be_nearly_twice_what_a_quarter_of_the_step_shows():
     """U of such an error is square in the step, of which three quarters are seen: 16/9 of U0."""
     assert not beyond_step_error(16 / 9 * 0.1, 0.1) and beyond_step_error(16 / 9 * 0.1 + 1e-6, 0.1)
     assert beyond_step_error(1e-9, 0.0) and not beyond_step_error(0.0, 0.0)
+
+
+def test_the_score_test_takes_off_what_the_time_step_does(found: Small):
+    """A residual that is all the step's is none, whatever effect looks like it; half of it is left by half a step."""
+    base, asked = found.base, directions_of(candidates(found.case.effects))
+    common = base.residuals.mean(axis=0)
+    plain = score_test(found.case.train, base, asked)
+    assert plain.p < 0.01
+    halved = score_test(replace(found.case.train, step_difference=0.5 * common), base, asked)
+    assert halved.size == pytest.approx(0.5 * plain.size, rel=0.1, abs=1e-3)
+    whole = score_test(replace(found.case.train, step_difference=common), base, asked)
+    assert whole.p > 0.1 and np.abs(whole.size).max() < 0.1 * np.abs(plain.size).max()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -11,6 +12,9 @@ import pytest
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
+from droid_jax.identify.identifiability import posterior
+from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
+from droid_jax.identify.search import CmaConfig
 from droid_jax.identify.solution_checks import SolutionCheck, check_solution, creep_of_fit, solution_notes
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.fields import joint_damping, joint_frictionloss
@@ -18,6 +22,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
+QUICK = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), samples=2)
 HINGE = """<mujoco><option integrator="implicitfast" timestep="{step}"/><worldbody><body><joint name="j" axis="0 1 0"
     damping="0.9" frictionloss="1e-6" armature="0.02"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".03" mass="1"/>
   </body></worldbody><actuator><position joint="j" kp="30" kv="1"/></actuator></mujoco>"""
@@ -52,7 +57,7 @@ def cost_of(scene: Scene, recording: Recording, engine: str = "mjx", **config) -
 def checked(step: float, engine: str = "mjx", side: TorqueSide = TorqueSide.MOTOR) -> SolutionCheck:
     recording = recorded(side)
     cost, values = cost_of(hinge(step), recording, engine)
-    return check_solution(cost, [recording], values, engine)["swing"]
+    return check_solution(cost, [recording], values, engine)[0]["swing"]
 
 
 @pytest.mark.slow
@@ -89,7 +94,7 @@ def test_engines_that_differ_are_said():
     scene, recording = hinge(0.002), recorded()
     scene.model.jnt_stiffnesspoly[0] = [0.0, 30.0]
     cost, values = cost_of(scene, recording)
-    check = check_solution(cost, [recording], values, "mjx")["swing"]
+    check = check_solution(cost, [recording], values, "mjx")[0]["swing"]
     assert check.engines_differ and not check.too_coarse
     said = solution_notes({"swing": check}, "swing")
     assert len(said) == 1 and "MJX and plain C MuJoCo differ at the fitted values of scene 'swing'" in said[0]
@@ -98,8 +103,22 @@ def test_engines_that_differ_are_said():
 def test_data_of_mj_step_have_no_error_of_its_step():
     recording = recorded()
     cost, values = cost_of(hinge(0.02), recording, mj_step=True)
-    check = check_solution(cost, [recording], values, "mjx")["swing"]
+    check = check_solution(cost, [recording], values, "mjx")[0]["swing"]
     assert check.discretisation is None and check.parity_rms is not None and check.parity_rms < 1e-3
+
+
+@pytest.mark.parametrize(("engine", "step"), [("mjx", 0.02), ("mujoco", 0.05)])
+def test_an_interval_is_as_wide_as_the_time_step_makes_it(engine: Literal["mjx", "mujoco"], step: float):
+    """The robot's step is 0.1 ms: the fit makes up for the scene's with another damping, and says so."""
+    scene, recording, truth = hinge(step), recorded(), 0.9
+    space = Space((joint_damping(scene, "j", std=0.5, high=10.0),))
+    found = identify_parameters(scene, space, recording, config=replace(QUICK, engine=engine))
+    assert found.refined is not None
+    (blind_low,), (blind_high,) = posterior(found.refined, found.fit.comparisons).interval()
+    (low,), (high,) = found.full_gaussian.interval()
+    assert low < truth < high and high - low > 1.2 * (blind_high - blind_low)
+    assert engine == "mujoco" or not blind_low < truth < blind_high
+    assert "by what the time step moves it" in found.full_gaussian.rule
 
 
 @pytest.mark.slow
@@ -111,7 +130,8 @@ def test_a_log_without_commands_has_no_time_step():
         channels={**recording.channels, "position": position},
     )  # fmt: skip
     cost, values = cost_of(hinge(0.002), bare)
-    assert check_solution(cost, [bare], values, "mjx") == {}
+    checks, off = check_solution(cost, [bare], values, "mjx")
+    assert checks == {} and not off.any()
 
 
 def test_a_replay_that_blows_up_at_half_its_step_is_said():
