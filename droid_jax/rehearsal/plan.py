@@ -56,13 +56,15 @@ def simulated_channels(
     recording: Recording,
     values: np.ndarray,
     config: DiscrepancyConfig,
+    engine: str = "mjx",
 ) -> Rollout:
     """What the replay makes of a recording's commands at values [D], without noise: one sample, host arrays [T, ...].
 
-    Its times count from the recording's first command.
+    Its times count from the recording's first command.  engine: "mjx", or "mujoco" for plain C (ValueError where it
+    lacks something).
     """
     drive = followed(scene, recording, config.compare)
-    replay = compiled_replay("mjx", scene, space, drive, effects)
+    replay = compiled_replay(engine, scene, space, drive, effects)
     rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
     if not bool(rollout.finite):
         raise ValueError(

@@ -16,22 +16,25 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
+from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, refit, with_finer_step, with_step_difference
+from droid_jax.discrepancy.fitting import FittedModel, step_difference, with_finer_step
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
+from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import RefineConfig, Refined
 from droid_jax.identify.search import NotReplayed
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.recording import Recording
-from droid_jax.recordings.split import Split, roles_of, split_of
+from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
 from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
 from droid_jax.rehearsal.plan import (
     ColumnNoise,
@@ -42,8 +45,10 @@ from droid_jax.rehearsal.plan import (
     simulated_channels,
 )
 from droid_jax.rehearsal.power import smallest_sizes
+from droid_jax.simulate.replay import Drive
 
-AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
+AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
+FINE = 16  # parts of a time step
 Tell = Callable[[str], None]
 
 
@@ -76,6 +81,7 @@ def rehearsed(
     tell: Tell = lambda stage: None,
     *,
     step_error: bool = True,
+    train_only: bool = False,
 ) -> Rehearsed:
     """The linear model of a search in these recordings.
 
@@ -88,7 +94,9 @@ def rehearsed(
         config: of the search.
         rehearsal: what is assumed.
         tell: called with each stage's name.
-        step_error: whether to measure what the time step leaves, which takes another compilation.
+        step_error: whether to measure what the time step leaves.
+        train_only: take the training part for the validation part too, and of each coefficient one shape; of recordings
+            with repeats.
 
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
@@ -100,50 +108,121 @@ def rehearsed(
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
     config = replace(config, channels=plan.channels or config.channels)
-    made, noise = _made(scene, whole, effects, recordings, at, plan, config, rehearsal)
+    clean = clean_channels(scene, space, whole, effects, at, plan, config)
+    made, noise = _made(clean, scene, recordings[:1] if train_only else recordings, plan, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
     split = split_of(made)
     roles = roles_of(split, made)
     every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
     clock("case")
     needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
+    if train_only:
+        needed = dict.fromkeys(("train", "validation"), roles["train"])
     case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
     values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
     clock("base")
     if split is Split.BLOCKS:
         base = base_model(case)
-        values = base.values
+        values, slopes = base.values, base.refined.jacobian
     else:
-        base = refit(case.train, case.base, (), values[None], AT_REST)
+        base, slopes = known_base(case.train, case.base, values)
     clock("sensitivities")
     directions = directions_of(candidates(case.effects))
-    train = part_of(case.train, base, directions)
-    if split is Split.REPEATS:
-        validation = train
-    else:
-        beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
-        validation = part_of(case.validation, beside_base, directions, base.refined.free)
+    if train_only:
+        directions = tuple(directions[k] for k in one_shape_each(directions))
+    free = base.refined.free
+    train = part_of(case.train, base, slopes[:, free], directions)
+    validation = train
+    if split is not Split.REPEATS and not train_only:
+        beside_base, slopes = known_base(case.validation, case.base, values, spreads=0)
+        validation = part_of(case.validation, beside_base, slopes[:, free], directions)
     if step_error and split is not Split.BLOCKS:
         clock("step error")
         with contextlib.suppress(NotReplayed):
-            fine = with_finer_step(case.train, case.base, roles["train"])
-            train = replace(train, step=with_step_difference(case.train, base, fine).step_difference)
+            fine = in_fine_steps(case.train, case.base, roles["train"])
+            train = replace(train, step=step_difference(case.train, base, fine))
     clock("")
     model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
 
 
-def _made(
+Clean = Callable[[Recording], Rollout]  # what a recording's commands make of the robot, without noise
+
+
+def clean_channels(
     scene: Scene,
+    space: Space,
     whole: Space,
     effects: Sequence[Effect],
-    recordings: Sequence[Recording],
     at: np.ndarray,
     plan: RehearsalPlan,
     config: DiscrepancyConfig,
-    rehearsal: RehearsalConfig,
+) -> Clean:
+    """The replay without noise at values `at` [D]: in plain C where only the noise of the repeats will count.
+
+    A mean of the repeats that is a little off changes nothing then: what is missing is looked for along slopes.
+    """
+
+    def simulated(recording: Recording) -> Rollout:
+        if (plan.repeats or recording.repeats) >= FEWEST_REPEATS:
+            with contextlib.suppress(ValueError):  # of what plain C does not have
+                return simulated_channels(scene, space, (), recording, at[whole.columns(space)], config, "mujoco")
+        return simulated_channels(ready(scene), whole, effects, recording, at, config)
+
+    return simulated
+
+
+def known_base(
+    residual_set: ResidualSet, base: Space, values: np.ndarray, spreads: int = 1
+) -> tuple[FittedModel, np.ndarray]:
+    """The base model at known values [D], with the slopes that a fit has; and [M, D] slopes along each axis.
+
+    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
+    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
+    may absorb of an effect is told by the steps along one axis.
+
+    spreads: see `LevenbergMarquardtConfig.spreads`.
+    """
+    whole, config = residual_set.cost.space, replace(AT_REST, spreads=spreads)
+
+    def residuals(rows: np.ndarray) -> np.ndarray:
+        return residual_set.whitened(whole.embed(base, rows, values))
+
+    problem = DampedProblem(residuals, base, config)
+    state, slopes = problem.start_with_slopes(problem.inside(base.to_search(values[None, whole.columns(base)])))
+    if not np.isfinite(state.objective[0]):
+        name = residual_set.comparison.name
+        raise NotReplayed(f"the simulation of {name!r} blows up at the parameters' values: begin at other ones")
+    x = state.x[0]
+    refined = Refined(
+        base, x, base.from_search(x), float(state.objective[0]), state.residual[0],
+        problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
+    )  # fmt: skip
+    rows = residual_set.resampling
+    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    at = whole.embed(base, refined.best[None], values)[0]
+    return FittedModel((), at, base, refined, left, rows.discrepancy(left)), slopes[0]
+
+
+def in_fine_steps(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
+    """The base model's cost in far finer steps: in plain C, where nothing is compiled, else as the search has it.
+
+    C's error is of first order; at a sixteenth of the step it is below that of the replay's own.
+    """
+    known = residual_set.cost
+    if isinstance(known.drives[0], Drive) and not isinstance(known, WindowedLog):
+        fine = with_options(known.scene, timestep=float(known.scene.model.opt.timestep) / FINE)
+        with contextlib.suppress(ValueError):  # of what plain C does not have
+            return make_cost(
+                fine, base, [recording], engine="mujoco", config=residual_set.comparison.config, check=False
+            )
+    return with_finer_step(residual_set, base, recording)
+
+
+def _made(
+    clean: Clean, scene: Scene, recordings: Sequence[Recording], plan: RehearsalPlan, rehearsal: RehearsalConfig
 ) -> tuple[list[Recording], list[ColumnNoise]]:
-    """The recordings to rehearse, and the noise of the first one's columns; at: [D] where parameters stand.
+    """The recordings to rehearse, and the noise of the first one's columns.
 
     Logs that are cut in time stay as they are: their noise is what fits leave of them.
     """
@@ -155,8 +234,7 @@ def _made(
     made = list[Recording]()
     noise = list[ColumnNoise]()
     for i, recording in enumerate(recordings):
-        rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
-        full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        full, each = planned_recording(scene, recording, clean(recording), plan, rehearsal, rehearsal.seed + i)
         made.append(full)
         noise = noise or each
     return made, noise
@@ -182,15 +260,13 @@ def _alike(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def part_of(
-    residual_set: ResidualSet, base: FittedModel, directions: Sequence[ScoreDirection], free: np.ndarray | None = None
+    residual_set: ResidualSet, base: FittedModel, slopes: np.ndarray, directions: Sequence[ScoreDirection]
 ) -> LinearPart:
-    """A part of the recordings in the linear model, at the values of `base`."""
-    free = base.refined.free if free is None else free
-    root = residual_set.repeats**0.5
+    """A part of the recordings in the linear model, at the values of `base`; slopes: [M, D] of its residual."""
     names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
     channel = np.array(names)[residual_set.column]
     raw = sensitivities(residual_set, base.values, directions)
-    rows, slopes = residual_set.resampling, base.refined.jacobian[:, free] / root
+    rows, slopes = residual_set.resampling, slopes / residual_set.repeats**0.5
     if rows.repeated:
         return LinearPart(raw, slopes, rows, channel)
     left = base.residuals.mean(axis=0)
@@ -205,25 +281,33 @@ def linear_model(
     validation: LinearPart,
 ) -> LinearModel:
     """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
-    space, minimum = case.full_space, case.minimum_sizes
+    space, minimum, refined = case.full_space, case.minimum_sizes, base.refined
+    room = [base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high)]
     of = [space[d.coefficient] for d in directions]
     return LinearModel(
         directions=tuple(directions),
         train=replace(train, raw=np.nan_to_num(train.raw)),
         validation=replace(validation, raw=np.nan_to_num(validation.raw)),
-        prior=base.refined.prior[base.refined.free],
+        prior=refined.prior[refined.free],
         slack=case.train.prior_slack,
         repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
         minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
         low=np.array([p.low - p.mean for p in of]),
         high=np.array([p.high - p.mean for p in of]),
+        base_low=room[0][refined.free],
+        base_high=room[1][refined.free],
     )
 
 
 def hidden_directions(model: LinearModel) -> list[int]:
+    """Of each coefficient at each place one direction (`one_shape_each`)."""
+    return one_shape_each(model.directions)
+
+
+def one_shape_each(directions: Sequence[ScoreDirection]) -> list[int]:
     """Of each coefficient at each place one direction: in the middle of the shapes that are tried."""
     groups: dict[str, list[int]] = {}
-    for k, direction in enumerate(model.directions):
+    for k, direction in enumerate(directions):
         groups.setdefault(direction.coefficient, []).append(k)
     return [rows[len(rows) // 2] for rows in groups.values()]
 
@@ -290,14 +374,8 @@ def improvements(
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
     out = []
-    for what, other, more, source in _variants(found, faster):
-        if source is found and not other.repeated and more > 1:
-            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
-            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
-            now = _recovered(found, other, rehearsal, more)
-        else:
-            sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
-            after, now = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
+
+    def helped(what: str, before: np.ndarray, after: np.ndarray, now: int) -> None:
         both = np.isfinite(before) & np.isfinite(after)
         ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
         out.append(
@@ -309,6 +387,21 @@ def improvements(
                 "recovered_more": now - recovered,
             }
         )
+
+    def sizes(of: LinearModel, rows: Sequence[int]) -> np.ndarray:
+        return np.array([s.size for s in smallest_sizes(of, rows, rehearsal, config.selection)])
+
+    for what, other, more in _variants(found):
+        if not other.repeated and more > 1:
+            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
+            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
+        else:
+            after = sizes(other, wanted)
+        helped(what, before, after, _recovered(found, other, rehearsal, more))
+    if faster is not None:  # of the training motion alone, as this one
+        moved, here = faster.model.of(found.compared), model.alone(every)
+        rows = [every.index(k) for k in wanted]
+        helped("the faster motion", sizes(here, rows), sizes(moved, rows), _recovered(faster, moved, rehearsal))
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
 
 
@@ -322,19 +415,17 @@ def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list
     return list(best.values())
 
 
-def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
+def _variants(found: Rehearsed) -> Iterator[tuple[str, LinearModel, float]]:
+    """What could be changed of the same motion, its linear model, and how many times as long a log is."""
     model = found.model.of(found.compared)
     for factor in (2, 4):
         if model.repeated:
-            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0, found
+            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0
         else:
-            yield f"a log {factor} times as long", model, float(factor), found
+            yield f"a log {factor} times as long", model, float(factor)
     for name in dict.fromkeys(found.model.train.channel.tolist()):
         if name not in found.compared:
-            what = name.replace("_", " ")
-            yield f"{what} compared too", found.model.of((*found.compared, name)), 1.0, found
-    if faster is not None:
-        yield "the faster motion", faster.model.of(found.compared), 1.0, faster
+            yield f"{name.replace('_', ' ')} compared too", found.model.of((*found.compared, name)), 1.0
 
 
 def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
@@ -369,7 +460,7 @@ def quick_rehearsal(
         rehearsal: what counts as found.
         tell: called with each stage's name.
         faster: whether a faster motion is looked at too.
-        step_error: whether to measure what the time step leaves, which takes another compilation.
+        step_error: whether to measure what the time step leaves.
 
     Returns:
         The linear model of the search, and its answers as plain data (rehearsal.json).
@@ -377,7 +468,7 @@ def quick_rehearsal(
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
     """
-    began = time.monotonic()
+    began, used = time.monotonic(), time.process_time()
     plan, config = plan or RehearsalPlan(), config or DiscrepancyConfig()
     rehearsal = rehearsal or RehearsalConfig()
     found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
@@ -386,12 +477,15 @@ def quick_rehearsal(
     model = found.model.of(found.compared)
     other = None
     if faster and found.model.repeated and all(r.command.size for r in recordings):
+        tell("a faster motion")
         moved = [faster_motion(r, rehearsal.faster) for r in recordings]
         other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
         try:
             with warnings.catch_warnings():  # what there is to warn of was said of the motion itself
                 warnings.simplefilter("ignore", UserWarning)
-                other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
+                other = rehearsed(
+                    scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False, train_only=True
+                )
         except ValueError as error:
             warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
     tell("improvements")
@@ -438,7 +532,7 @@ def quick_rehearsal(
         ],
         "effects": known,
         "helps": helps,
-        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began},
+        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began, "cpu": time.process_time() - used},
     }
     return found, answer
 
