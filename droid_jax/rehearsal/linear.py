@@ -43,6 +43,7 @@ class RehearsalConfig:
       position and camera are those of a Panda.
     margin: times what the linear model predicts that a size must be; of ten effects on a lone hinge four were found at
       1.4 times that and not at it, since another robot's parameters and law are not quite the linear ones.
+    known: share of what is left of an effect that the library's own must take, for it to be said to be found.
     faster: how many times as fast the other motion is.
     seed: of the draws.
     """
@@ -55,6 +56,7 @@ class RehearsalConfig:
     pooling: float = 12.0
     noise: dict[str, float] = field(default_factory=_assumed)
     margin: float = 1.4
+    known: float = 0.5
     faster: float = 1.5
     seed: int = 0
 
@@ -68,6 +70,7 @@ class RehearsalConfig:
             pooling=partial(number, above=0),
             noise=weights,
             margin=partial(number, least=1),
+            known=partial(number, least=0, below=1),
             faster=partial(number, above=0),
             seed=partial(whole, least=0),
         )
@@ -226,12 +229,13 @@ class Leftover:
     begins: [P] sizes at which one more of the parameters has come to a bound, the first 0.
     train, validation: [P, 2, M] of each piece what is left at size 0 and what each unit adds: of the score test's
       residual, and on the validation part of a model that was fitted without the effect.
-    room: the largest size.
+    free: [P, D] bool, the parameters that are not at a bound.  room: the largest size.
     """
 
     begins: np.ndarray
     train: np.ndarray
     validation: np.ndarray
+    free: np.ndarray
     room: float
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -262,21 +266,27 @@ class Leftover:
 
 
 def leftover(model: LinearModel, k: int) -> Leftover:
-    """What the base parameters leave of direction k.
+    """What the base parameters leave of direction k (`leftover_of`)."""
+    raw, other = (model.sign[k] * part.raw[k] for part in (model.train, model.validation))
+    return leftover_of(model, raw, other, float(model.room[k]))
+
+
+def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, room: float) -> Leftover:
+    """What the base parameters leave of something that adds raw [M] to the training part and other [M] to the other.
 
     They are fitted to it with their priors and within their bounds, along the way on which one after the other stops at
     a bound: a nuisance that could stand for all of an effect does so only as far as it may move.
     """
     train, validation = model.train, model.validation
     held, loose = model.held(1.0), model.held(model.slack)
-    raw, other = (model.sign[k] * part.raw[k] for part in (train, validation))
-    count, room = len(model.prior), float(model.room[k])
+    count = len(model.prior)
     low = np.full(count, -np.inf) if model.base_low is None else np.minimum(model.base_low, 0.0)
     high = np.full(count, np.inf) if model.base_high is None else np.maximum(model.base_high, 0.0)
     normal, toward = train.base.T @ train.base + np.diag(held**-2), train.base.T @ raw
     free, at, begins = np.ones(count, bool), np.zeros(count), [0.0]
-    pieces = list[tuple[np.ndarray, np.ndarray]]()
+    pieces, frees = list[tuple[np.ndarray, np.ndarray]](), list[np.ndarray]()
     while True:
+        frees.append(free.copy())
         there, grows = at.copy(), np.zeros(count)
         inside = normal[np.ix_(free, free)]
         there[free] = np.linalg.solve(inside, -normal[np.ix_(free, ~free)] @ at[~free]) if free.any() else 0.0
@@ -295,7 +305,30 @@ def leftover(model: LinearModel, k: int) -> Leftover:
             break
         free[k_next], at[k_next] = False, bound[k_next]
         begins.append(float(reached[k_next]))
-    return Leftover(np.array(begins), *(np.stack(part) for part in zip(*pieces, strict=True)), room)
+    return Leftover(np.array(begins), *(np.stack(part) for part in zip(*pieces, strict=True)), np.array(frees), room)
+
+
+def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[EffectKey, float]:
+    """Share of the square of a training residual [M] that each candidate takes linearly, in its best shape.
+
+    free: [D] base parameters that absorb.
+    """
+    base, held = model.train.base[:, free], model.held(model.slack)[free]
+    columns = project(np.nan_to_num(model.train.raw), base, held)
+    whole, out = max(float(left @ left), 1e-30), dict[EffectKey, float]()
+    for rows in model.shaped:
+        key = model.directions[rows[0]].candidate.key
+        low, high = np.where(model.low[rows] < 0, -np.inf, 0.0), np.where(model.high[rows] > 0, np.inf, 0.0)
+        gram, toward = columns[rows] @ columns[rows].T, columns[rows] @ left
+        coefficients = _within(gram, toward, low, high)
+        share = float(coefficients @ (2 * toward - gram @ coefficients)) / whole
+        out[key] = max(share, out.get(key, 0.0))
+    return out
+
+
+def distinguishable(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
+    """Squared noncentrality that must stand between two models for the search to distinguish them."""
+    return _needed(model, config, share)
 
 
 @dataclass(frozen=True)

@@ -33,15 +33,27 @@ from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, with_options
+from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.linear import (
+    LinearModel,
+    LinearPart,
+    RehearsalConfig,
+    distinguishable,
+    leftover_of,
+    rivals_of,
+    taken_by,
+)
 from droid_jax.rehearsal.plan import (
     ColumnNoise,
+    HiddenCase,
     RehearsalPlan,
     faster_motion,
+    hidden_form,
     noise_of_log,
     planned_recording,
+    robot_trace,
     simulated_channels,
 )
 from droid_jax.rehearsal.power import smallest_sizes
@@ -111,7 +123,8 @@ def rehearsed(
     clean = clean_channels(scene, space, whole, effects, at, plan, config)
     made, noise = _made(clean, scene, recordings[:1] if train_only else recordings, plan, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
-    split = split_of(made)
+    halves = Split.RECORDINGS if len(recordings) > 1 else Split.REPEATS
+    split = halves if train_only else split_of(made)
     roles = roles_of(split, made)
     every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
     clock("case")
@@ -361,6 +374,93 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
     return out
 
 
+def robot_whitened(
+    found: Rehearsed,
+    space: Space,
+    recording: Recording,
+    case: HiddenCase,
+    config: DiscrepancyConfig,
+) -> np.ndarray:
+    """[M] what the synthetic robot with something hidden measures of the training motion, in one repeat's noise."""
+    comparison, scene = found.case.train.comparison, found.case.train.cost.scene
+    known = found.base.values[found.case.full_space.columns(space)]
+    trace = robot_trace(scene, space, recording, known, case, config, 0)
+    clock = comparison.clock - comparison.clock[0]
+    fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
+    angle = np.interp(clock, trace.time, trace.object_angle)
+    on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
+    return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
+
+
+def law_checks(
+    found: Rehearsed,
+    space: Space,
+    known: Sequence[Mapping[str, Any]],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+) -> list[dict[str, Any] | None]:
+    """Of each answer whether an effect of that size would be known for what it is; None where none is found.
+
+    The linear model takes effects to be small and the robot's law to be the library's.  Here each is simulated at the
+    size that was found, and at its best place once more with the law of the synthetic robot, which is written another
+    way, where it has one.  Of the two the worse counts: `own` is the share of what the base parameters leave of it that
+    the library's effect takes, `other` a candidate that takes more.
+    """
+    out: list[dict[str, Any] | None] = [None] * len(known)
+    sizes = [e["smallest"] for e in known]
+    asked = [i for i, size in enumerate(sizes) if np.isfinite(size)]
+    if not found.model.repeated or not asked:
+        return out
+    train, wanted, model = found.case.train, hidden_directions(found.model), found.model.of(found.compared)
+    seen = np.isin(found.model.train.channel, found.compared)
+
+    def check(i: int, difference: np.ndarray, law: str) -> None:
+        if not np.isfinite(difference).all():
+            return
+        left = leftover_of(model, difference[seen], difference[seen], 1.0)
+        taken = taken_by(model, left.at(1.0)[0], left.free[-1])
+        own = max(v for key, v in taken.items() if (key.effect, key.location) == _place(known[i]))
+        rival = max(taken, key=taken.__getitem__)
+        apart = known[i]["noncentrality"] ** 2 * (taken[rival] - own)
+        confused = apart > distinguishable(model, config, rehearsal.share)
+        other = {"effect": rival.effect, "location": rival.location, "share": taken[rival]} if confused else None
+        before, sure = out[i], bool(own >= rehearsal.known and not confused)
+        if before is None or (own < before["own"] and not (before["sure"] is False and sure)):
+            out[i] = {"law": law, "own": own, "other": other, "sure": sure}
+
+    far = [sizes[i] * float(found.model.sign[wanted[i]]) for i in asked]
+    slopes = sensitivities(train, found.base.values, [found.model.directions[wanted[i]] for i in asked], far)
+    for i, slope, size in zip(asked, slopes, far, strict=True):
+        check(i, slope * size, "the library's")
+    for i, difference in _other_laws(found, space, known, config):
+        check(i, difference, "the synthetic robot's")
+    return out
+
+
+def _other_laws(
+    found: Rehearsed, space: Space, known: Sequence[Mapping[str, Any]], config: DiscrepancyConfig
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Of each effect's best place what the synthetic robot's law adds to the training motion, [M], where it has one."""
+    recording, scene = found.roles["train"], found.case.train.cost.scene
+    if not recording.command.size:
+        return
+    best = [entry for entry, _ in _one_each(known, range(len(known)))]
+    plain: np.ndarray | None = None
+    for i, entry in enumerate(known):
+        name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
+        if not name or not np.isfinite(entry["smallest"]) or not any(entry is one for one in best):
+            continue
+        hidden = HiddenCase(0, hidden=name, joint=joint, amplitude=entry["smallest"])
+        with contextlib.suppress(ValueError):  # a simulation that blows up
+            if plain is None:
+                plain = robot_whitened(found, space, recording, HiddenCase(0), config)
+            yield i, robot_whitened(found, space, recording, hidden, config) - plain
+
+
+def _place(entry: Mapping[str, Any]) -> tuple[str, str]:
+    return entry["effect"], entry["location"]
+
+
 def improvements(
     found: Rehearsed,
     known: Sequence[Mapping[str, Any]],
@@ -474,6 +574,9 @@ def quick_rehearsal(
     found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
     tell("tests")
     known = answers(found, config, rehearsal)
+    tell("laws")
+    checks = law_checks(found, space, known, config, rehearsal)
+    known = [{**entry, "law": check} for entry, check in zip(known, checks, strict=True)]
     model = found.model.of(found.compared)
     other = None
     if faster and found.model.repeated and all(r.command.size for r in recordings):
