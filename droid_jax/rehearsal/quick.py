@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
-from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.cost import make_cost
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
@@ -60,7 +60,7 @@ from droid_jax.rehearsal.power import smallest_sizes
 from droid_jax.simulate.replay import Drive
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
-FINE = 16  # parts of a time step
+FINE = (8, 32)  # parts of a time step
 Tell = Callable[[str], None]
 
 
@@ -152,8 +152,7 @@ def rehearsed(
     if step_error and split is not Split.BLOCKS:
         clock("step error")
         with contextlib.suppress(NotReplayed):
-            fine = in_fine_steps(case.train, case.base, roles["train"])
-            train = replace(train, step=step_difference(case.train, base, fine))
+            train = replace(train, step=fine_steps(case.train, base, case.base, roles["train"]))
     clock("")
     model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
@@ -217,19 +216,29 @@ def known_base(
     return FittedModel((), at, base, refined, left, rows.discrepancy(left)), slopes[0]
 
 
-def in_fine_steps(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
-    """The base model's cost in far finer steps: in plain C, where nothing is compiled, else as the search has it.
+def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recording: Recording) -> np.ndarray | None:
+    """[M] what far finer time steps change of the base model, in one repeat's noise; None in inverse mode.
 
-    C's error is of first order; at a sixteenth of the step it is below that of the replay's own.
+    In plain C, where nothing is compiled.  Its error is of first order in the step: of two steps' it is extrapolated
+    to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.
     """
     known = residual_set.cost
-    if isinstance(known.drives[0], Drive) and not isinstance(known, WindowedLog):
-        fine = with_options(known.scene, timestep=float(known.scene.model.opt.timestep) / FINE)
-        with contextlib.suppress(ValueError):  # of what plain C does not have
-            return make_cost(
-                fine, base, [recording], engine="mujoco", config=residual_set.comparison.config, check=False
+    if not isinstance(known.drives[0], Drive) or isinstance(known, WindowedLog):
+        return step_difference(residual_set, model, with_finer_step(residual_set, base, recording))
+    config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
+    try:
+        coarse, fine = (
+            make_cost(
+                with_options(known.scene, timestep=timestep / parts), base, [recording], engine="mujoco", config=config,
+                check=False,
             )
-    return with_finer_step(residual_set, base, recording)
+            for parts in FINE
+        )  # fmt: skip
+    except ValueError:
+        return step_difference(residual_set, model, with_finer_step(residual_set, base, recording))
+    near, nearer = (step_difference(residual_set, model, cost) for cost in (coarse, fine))
+    assert near is not None and nearer is not None
+    return nearer + (nearer - near) / (FINE[1] / FINE[0] - 1)
 
 
 def _made(
