@@ -426,7 +426,7 @@ def law_checks(
     def check(i: int, difference: np.ndarray, law: str) -> None:
         if not np.isfinite(difference).all():
             return
-        left = leftover_of(model, difference[seen], difference[seen], 1.0)
+        left = leftover_of(model, difference[seen], np.zeros(len(model.validation.base)), 1.0)
         taken = taken_by(model, left.at(1.0)[0], left.free[-1])
         own = max(v for key, v in taken.items() if (key.effect, key.location) == _place(known[i]))
         rival = max(taken, key=taken.__getitem__)
