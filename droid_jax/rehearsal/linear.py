@@ -106,6 +106,11 @@ class LinearPart:
         each = (None if a is None else a[kept] for a in (self.step, self.residual, self.column))
         return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, *each)
 
+    def quieter(self, share: float) -> LinearPart:
+        """The same with so much of its residual, of blocks."""
+        assert self.residual is not None
+        return replace(self, residual=share * self.residual, level=share**2 * self.level)
+
     def noise(self, draws: int, rng: np.random.Generator) -> np.ndarray:
         """[R, M] drawn noise of one log: the base residual with other phases, column by column, where it counts.
 
