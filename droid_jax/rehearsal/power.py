@@ -55,10 +55,9 @@ def smallest_sizes(
     about = np.array([_about(of, units) for of in left])
     rows = [of.at(size) for of, size in zip(left, about, strict=True)]
     scores = score_draws(model, config, np.array([train for train, _ in rows]).reshape(len(rows), -1))
-    out = []
+    spread, out = fit_deviations(model, config), list[Smallest]()
     for i, (k, of) in enumerate(zip(wanted, left, strict=True)):
-        strength = float(np.linalg.norm(model.loosest[k])) * units  # of a unit beside all base parameters, unbounded
-        if strength < 1e-12 or of.norms[1][-1] < 1e-12:
+        if not np.isfinite(spread[k]) or of.norms[1][-1] < 1e-12:
             out.append(Smallest(np.inf, {}, "no signal", np.nan))
             continue
         often = max(float(scipy.stats.norm.ppf(config.share)), 0.0)
@@ -69,8 +68,8 @@ def smallest_sizes(
             "time step": discrepancy_crossings(model, k, of, config),
         }
         fixed = {
-            "minimum effect size": float(model.minimum[k]) + often / strength,
-            "interval": (surely + often) / strength,
+            "minimum effect size": float(model.minimum[k]) + often * spread[k],
+            "interval": (surely + often) * spread[k],
             "weak imitation": unhindered(model, k, config.share),
         }
         limits = {name: float(np.quantile(a, config.share, method="higher")) for name, a in drawn.items()} | fixed
@@ -82,6 +81,20 @@ def smallest_sizes(
         noncentrality = units * float(np.interp(found, *of.norms[:2])) if np.isfinite(found) else np.inf
         out.append(Smallest(found, limits, limit, noncentrality))
     return out
+
+
+def fit_deviations(model: LinearModel, config: RehearsalConfig) -> np.ndarray:
+    """[K] by how much noise moves the fitted size of each coefficient, beside all base parameters; inf without signal.
+
+    That of blocks is not white: it is drawn.
+    """
+    sensitivities = model.loosest
+    size = np.linalg.norm(sensitivities, axis=1)
+    noise = np.full(len(size), model.repeats**-0.5)
+    if not model.repeated:
+        drawn = model.train.noise(config.draws, np.random.default_rng([config.seed, 4]))
+        noise = np.std(drawn @ _units(sensitivities).T, axis=0)
+    return np.where(size * model.repeats**0.5 > 1e-12, noise / np.maximum(size, 1e-30), np.inf)
 
 
 def _about(of: Leftover, units: float) -> float:
