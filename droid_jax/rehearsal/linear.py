@@ -192,12 +192,21 @@ class LinearModel:
         """[K, M] sensitivities of the training part, as the score test has them."""
         return project(self.train.raw, self.train.base, self.held(self.slack))
 
+    @cached_property
+    def absorbed(self) -> np.ndarray:
+        """[D, K] by how much a unit moves the base parameters that are fitted to the training part, without bounds."""
+        base, held = self.train.base, self.held(1.0)
+        return np.linalg.solve(base.T @ base + np.diag(held**-2), base.T @ np.nan_to_num(self.train.raw).T)
+
+    def inside(self, moved: np.ndarray) -> bool:
+        """Whether base parameters that moved by so much [D] are within their bounds."""
+        if self.base_low is None or self.base_high is None:
+            return True
+        return bool(np.all((moved >= self.base_low) & (moved <= self.base_high)))
+
     def unabsorbed(self) -> np.ndarray:
         """[K, M] what a unit adds to the validation part once the base is fitted to the training part."""
-        base, held = self.train.base, self.held(1.0)
-        normal = base.T @ base + np.diag(held**-2)
-        absorbed = np.linalg.solve(normal, base.T @ self.train.raw.T)  # [D, K]
-        return self.validation.raw - (self.validation.base @ absorbed).T
+        return self.validation.raw - (self.validation.base @ self.absorbed).T
 
     @cached_property
     def loosest(self) -> np.ndarray:
@@ -394,9 +403,11 @@ def imitations(model: LinearModel, k: int, size: float | None = None) -> list[Im
 
     size: of the effect, at which bounds of the others count; None: only their signs do.
     """
-    products, own, times = model.products, model.directions[k].candidate.key, size or 1.0
-    whole = float(products[k, k])
-    if whole <= 0:
+    own, times = model.directions[k].candidate.key, size or 1.0
+    free = times * model.sign[k] * model.added[k]
+    targets = [free] if size is None or model.base_low is None else [free, leftover(model, k).at(size)[1]]
+    alongs = [model.added @ target for target in targets]
+    if min(float(target @ target) for target in targets) <= 0:
         return []
     best: dict[EffectKey, Imitation] = {}
     for rows in model.shaped:
@@ -406,13 +417,17 @@ def imitations(model: LinearModel, k: int, size: float | None = None) -> list[Im
         low, high = model.low[rows], model.high[rows]
         if size is None:
             low, high = np.where(low < 0, -np.inf, 0.0), np.where(high > 0, np.inf, 0.0)
-        toward = times * model.sign[k] * products[rows, k]
-        coefficients = _within(products[np.ix_(rows, rows)], toward, low, high)
-        taken = float(coefficients @ (2 * toward - products[np.ix_(rows, rows)] @ coefficients))
-        share = taken / (times**2 * whole)
+        gram = model.products[np.ix_(rows, rows)]
+        for tried, along in zip(targets, alongs, strict=True):
+            coefficients = _within(gram, along[rows], low, high)
+            moved = times * model.sign[k] * model.absorbed[:, k] - model.absorbed[:, rows] @ coefficients
+            if size is None or model.inside(moved):
+                break  # beside this candidate the base parameters may take what is left
+        whole = float(tried @ tried)
+        share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
         if key not in best or share > best[key].share:
             least = model.minimum[rows] / np.maximum(np.abs(coefficients) / times, 1e-30)
-            strength = whole * (model.repeats if model.repeated else 1)
+            strength = whole / times**2 * (model.repeats if model.repeated else 1)
             best[key] = Imitation(key, share, strength, float(least.min()))
     return list(best.values())
 

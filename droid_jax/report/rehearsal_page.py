@@ -14,6 +14,7 @@ from droid_jax.report.text import counted, html, label, listed, percent, quantit
 Result = Mapping[str, Any]
 MOST_RIVALS = 3
 MOST, MOST_PAIRS = 6, 3  # things that a sentence lists
+KNOWN = ("N m", "N", "kg", "m", "rad", "s")  # units of sizes that people have a feeling for
 NEAR = 2.0  # times the minimum effect size
 HELPS = 1.1  # times smaller, from which a change is worth a sentence
 
@@ -130,7 +131,7 @@ def rehearsal_sentences(result: Result) -> list[str]:
     lost = [e for e in best if e["smallest"] is None]
     out = []
     if found:
-        ranked = sorted([e for e in found if e["unit"] != "-"] or found, key=_multiple)  # sizes that people know
+        ranked = sorted([e for e in found if e["unit"] in KNOWN] or found, key=_multiple)
         first, last = ranked[0], ranked[-1]
         sentence = (
             f"With this motion {_thing(first)} would be found from {quantity(first['smallest'], first['unit'], 2)}"
