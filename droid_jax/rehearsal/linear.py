@@ -419,11 +419,10 @@ def imitations(model: LinearModel, k: int, size: float | None = None) -> list[Im
             low, high = np.where(low < 0, -np.inf, 0.0), np.where(high > 0, np.inf, 0.0)
         gram = model.products[np.ix_(rows, rows)]
         for tried, along in zip(targets, alongs, strict=True):
-            coefficients = _within(gram, along[rows], low, high)
+            coefficients, whole = _within(gram, along[rows], low, high), float(tried @ tried)
             moved = times * model.sign[k] * model.absorbed[:, k] - model.absorbed[:, rows] @ coefficients
             if size is None or model.inside(moved):
                 break  # beside this candidate the base parameters may take what is left
-        whole = float(tried @ tried)
         share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
         if key not in best or share > best[key].share:
             least = model.minimum[rows] / np.maximum(np.abs(coefficients) / times, 1e-30)
