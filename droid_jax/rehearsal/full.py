@@ -134,12 +134,12 @@ def equally_strong(
         return case
     model = found.model
 
-    def whitened(of: HiddenCase) -> np.ndarray:
-        return robot_whitened(found, space, recording, of, config)
-
+    hidden, nothing = robot_whitened(found, space, recording, [case, HiddenCase(0)], config)
+    if hidden is None or nothing is None:
+        return case
     seen = np.isin(model.train.channel, found.compared)
     part = model.of(found.compared)
-    left = project((whitened(case) - whitened(HiddenCase(0)))[None, seen], part.train.base, part.held(part.slack))[0]
+    left = project((hidden - nothing)[None, seen], part.train.base, part.held(part.slack))[0]
     sensitivities, best = part.projected(), 0.0
     groups: dict[object, list[int]] = {}
     for k, direction in enumerate(part.directions):

@@ -319,7 +319,8 @@ def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, room: fl
             break
         free[k_next], at[k_next] = False, bound[k_next]
         begins.append(float(reached[k_next]))
-    return Leftover(np.array(begins), *(np.stack(part) for part in zip(*pieces, strict=True)), np.array(frees), room)
+    left, beside = (np.stack(part) for part in zip(*pieces, strict=True))
+    return Leftover(np.array(begins), left, beside, np.array(frees), room)
 
 
 def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[EffectKey, float]:

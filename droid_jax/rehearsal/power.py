@@ -231,11 +231,13 @@ def _of_repeats(
         near = np.abs(gram[shown, k]) > BESIDE
         others = quiet[:, :, ~near].max(axis=2, initial=0.0)
         mine = of_noise(np.array([k]))
-        beside = [np.concatenate([a[..., near], b], axis=-1) for a, b in zip((means, mean, square), mine, strict=True)]
+        both = zip((means, mean, square), mine, strict=True)
+        flipped_means, own_mean, own_square = (np.concatenate([a[..., near], b], axis=-1) for a, b in both)
         unit_added = (gram[np.r_[shown[near], k], k] / np.sqrt(count)).astype(np.float32)
 
         def rejects(strength: np.ndarray) -> np.ndarray:
-            largest = np.maximum(others, shares(*beside, strength[:, None].astype(np.float32) * unit_added).max(axis=2))
+            added = strength[:, None].astype(np.float32) * unit_added
+            largest = np.maximum(others, shares(flipped_means, own_mean, own_square, added).max(axis=2))
             t = np.sqrt((count - 1) * largest[0] / np.maximum(1.0 - largest[0], 1e-30))
             limit = flipped.isf(own.sf(t)) ** 2
             return np.mean(largest >= limit / (count - 1 + limit) * (1 - 1e-12), axis=0) < significance

@@ -10,11 +10,13 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from droid_jax import runtime
 from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.windowed_log import WindowedLog
@@ -60,6 +62,7 @@ from droid_jax.rehearsal.power import smallest_sizes
 from droid_jax.simulate.replay import Drive
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
+ROUGHLY = 5  # iterations of a base fit whose residual is taken for noise
 FINE = (8, 32)  # parts of a time step
 Tell = Callable[[str], None]
 
@@ -130,8 +133,9 @@ def rehearsed(
     clock("case")
     needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
     if train_only:
-        needed = dict.fromkeys(("train", "validation"), roles["train"])
-    case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
+        needed = {"train": roles["train"], "validation": roles["train"]}
+    refine = replace(config.refine, iterations=min(config.refine.iterations, ROUGHLY))  # of windows, which are fitted
+    case = case_of(split, scene, space, effects, needed, replace(config, channels=every, refine=refine))
     values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
     clock("base")
     if split is Split.BLOCKS:
@@ -404,21 +408,31 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
 
 
 def robot_whitened(
-    found: Rehearsed,
-    space: Space,
-    recording: Recording,
-    case: HiddenCase,
-    config: DiscrepancyConfig,
-) -> np.ndarray:
-    """[M] what the synthetic robot with something hidden measures of the training motion, in one repeat's noise."""
+    found: Rehearsed, space: Space, recording: Recording, cases: Sequence[HiddenCase], config: DiscrepancyConfig
+) -> list[np.ndarray | None]:
+    """[M] of each case what the synthetic robot measures of the training motion, in one repeat's noise.
+
+    None where its simulation blows up.  MuJoCo's steps leave Python to the other threads.
+    """
     comparison, scene = found.case.train.comparison, found.case.train.cost.scene
     known = found.base.values[found.case.full_space.columns(space)]
-    trace = robot_trace(scene, space, recording, known, case, config, 0)
     clock = comparison.clock - comparison.clock[0]
-    fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
-    angle = np.interp(clock, trace.time, trace.object_angle)
-    on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
-    return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
+
+    def simulated(case: HiddenCase) -> Rollout | None:
+        try:
+            return robot_trace(scene, space, recording, known, case, config, 0)
+        except ValueError:
+            return None
+
+    def whitened(trace: Rollout) -> np.ndarray:
+        fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
+        angle = np.interp(clock, trace.time, trace.object_angle)
+        on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
+        return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
+
+    with ThreadPoolExecutor(runtime.cores()) as pool:
+        traces = list(pool.map(simulated, cases))
+    return [None if trace is None else whitened(trace) for trace in traces]
 
 
 def law_checks(
@@ -474,16 +488,18 @@ def _other_laws(
     if not recording.command.size:
         return
     best = [entry for entry, _ in _one_each(known, range(len(known)))]
-    plain: np.ndarray | None = None
+    asked, cases = list[int](), [HiddenCase(0)]
     for i, entry in enumerate(known):
         name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
-        if not name or not np.isfinite(entry["smallest"]) or not any(entry is one for one in best):
-            continue
-        hidden = HiddenCase(0, hidden=name, joint=joint, amplitude=entry["smallest"])
-        with contextlib.suppress(ValueError):  # a simulation that blows up
-            if plain is None:
-                plain = robot_whitened(found, space, recording, HiddenCase(0), config)
-            yield i, robot_whitened(found, space, recording, hidden, config) - plain
+        if name and np.isfinite(entry["smallest"]) and any(entry is one for one in best):
+            asked.append(i)
+            cases.append(HiddenCase(0, hidden=name, joint=joint, amplitude=entry["smallest"]))
+    if not asked:
+        return
+    plain, *others = robot_whitened(found, space, recording, cases, config)
+    for i, other in zip(asked, others, strict=True):
+        if plain is not None and other is not None:
+            yield i, other - plain
 
 
 def _place(entry: Mapping[str, Any]) -> tuple[str, str]:
