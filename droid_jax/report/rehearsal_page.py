@@ -13,7 +13,7 @@ from droid_jax.report.text import counted, html, label, listed, percent, quantit
 
 Result = Mapping[str, Any]
 MOST_RIVALS = 3
-MOST, MOST_PAIRS = 6, 3  # things that a sentence lists
+MOST, MOST_PAIRS, MOST_NAMES = 6, 3, 3  # things that a sentence lists
 KNOWN = ("N m", "N", "kg", "m", "rad", "s")  # units of sizes that people have a feeling for
 NEAR = 2.0  # times the minimum effect size
 HELPS = 1.1  # times smaller, from which a change is worth a sentence
@@ -25,6 +25,7 @@ def rehearsal_page(result: Result) -> str:
     return html(
         "rehearsal.html.jinja",
         result=result,
+        recordings=motions_of(result),
         sentences=rehearsal_sentences(result),
         parameters=parameter_rows(result),
         effects=effect_rows(result),
@@ -33,6 +34,14 @@ def rehearsal_page(result: Result) -> str:
         how=how_sentences(result),
         full=full_rows(result),
         figure=figure,
+    )
+
+
+def motions_of(result: Result) -> str:
+    """Their names, of many the first ones and how many there are."""
+    names = list(result["recordings"])
+    return (
+        listed(names) if len(names) <= MOST_NAMES else f"{counted(len(names), 'recording')}, {names[0]} to {names[-1]}"
     )
 
 
