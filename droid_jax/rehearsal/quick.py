@@ -23,7 +23,7 @@ from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, step_difference, with_finer_step
+from droid_jax.discrepancy.fitting import FittedModel, with_finer_step, with_step_difference
 from droid_jax.discrepancy.log_case import base_model, case_of, least_residual
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
@@ -231,7 +231,7 @@ def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recor
     """
     known = residual_set.cost
     if not isinstance(known.drives[0], Drive) or isinstance(known, WindowedLog):
-        return step_difference(residual_set, model, with_finer_step(residual_set, base, recording))
+        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
     config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
     try:
         coarse, fine = (
@@ -242,8 +242,8 @@ def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recor
             for parts in FINE
         )  # fmt: skip
     except ValueError:
-        return step_difference(residual_set, model, with_finer_step(residual_set, base, recording))
-    near, nearer = (step_difference(residual_set, model, cost) for cost in (coarse, fine))
+        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
+    near, nearer = (with_step_difference(residual_set, model, cost).step_difference for cost in (coarse, fine))
     assert near is not None and nearer is not None
     return nearer + (nearer - near) / (FINE[1] / FINE[0] - 1)
 

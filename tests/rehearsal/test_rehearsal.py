@@ -19,7 +19,7 @@ from benchmarks.rehearse import measured_size, next_step, summary
 from droid_jax.commands.rehearse import plain
 from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
-from droid_jax.discrepancy.fitting import step_difference, with_finer_step
+from droid_jax.discrepancy.fitting import with_finer_step, with_step_difference
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p
 from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
 from droid_jax.identify.pipeline import IdentifyConfig
@@ -268,7 +268,7 @@ def test_plain_c_in_fine_steps_tells_the_step_error(hinge):
     of = rehearsed(*asked, step_error=False)
     train, roles = of.case.train, of.roles
     known = fine_steps(train, of.base, of.case.base, roles["train"])
-    own = step_difference(train, of.base, with_finer_step(train, of.case.base, roles["train"]))
+    own = with_step_difference(train, of.base, with_finer_step(train, of.case.base, roles["train"])).step_difference
     assert known is not None and own is not None
     assert known @ own > 0.9 * np.linalg.norm(known) * np.linalg.norm(own)
     assert 0.9 < np.linalg.norm(known) / np.linalg.norm(own) < 1.6  # a quarter of the step has an error too
