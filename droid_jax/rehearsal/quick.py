@@ -445,9 +445,9 @@ def law_checks(
     """Of each answer whether an effect of that size would be known for what it is; None where none is found.
 
     The linear model takes effects to be small and the robot's law to be the library's.  Here each is simulated at the
-    size that was found, and at its best place once more with the law of the synthetic robot, which is written another
-    way, where it has one.  Of the two the worse counts: `own` is the share of what the base parameters leave of it that
-    the library's effect takes, `other` a candidate that takes more.
+    size that was found.  One whose law has a shape is simulated at its best place once more with the law of the
+    synthetic robot, which has another.  Of the two the worse counts: `own` is the share of what the base parameters
+    leave of it that the library's effect takes, `other` a candidate that takes clearly more.
     """
     out: list[dict[str, Any] | None] = [None] * len(known)
     sizes = [e["smallest"] for e in known]
@@ -466,6 +466,7 @@ def law_checks(
         rival = max(taken, key=taken.__getitem__)
         apart = known[i]["noncentrality"] ** 2 * (taken[rival] - own)
         confused = apart > distinguishable(model, config, rehearsal.share)
+        confused &= 1 - own > config.selection.equivalence_factor * (1 - taken[rival])
         other = {"effect": rival.effect, "location": rival.location, "share": taken[rival]} if confused else None
         before, sure = out[i], bool(own >= rehearsal.known and not confused)
         if before is None or (own < before["own"] and not (before["sure"] is False and sure)):
@@ -483,13 +484,16 @@ def law_checks(
 def _other_laws(
     found: Rehearsed, space: Space, known: Sequence[Mapping[str, Any]], config: DiscrepancyConfig
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Of each effect's best place what the synthetic robot's law adds to the training motion, [M], where it has one."""
+    """[M] of each effect with a shape, at its best place: what the synthetic robot's law adds to the training motion."""
     recording, scene = found.roles["train"], found.case.train.cost.scene
     if not recording.command.size:
         return
     best = [entry for entry, _ in _one_each(known, range(len(known)))]
     asked, cases = list[int](), [HiddenCase(0)]
+    shaped = {effect.name for effect in found.case.effects if effect.shape_parameters}
     for i, entry in enumerate(known):
+        if entry["effect"] not in shaped:
+            continue
         name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
         if name and np.isfinite(entry["smallest"]) and any(entry is one for one in best):
             asked.append(i)

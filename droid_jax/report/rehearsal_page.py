@@ -230,9 +230,9 @@ def how_sentences(result: Result) -> list[str]:
         f"{how['directions']} coefficients has p < {how['significance']:g}, and the validation test p < "
         f"{how['confirmation']:g}.",
         "The residual is taken to be linear in parameters and effects.",
-        "Then each effect was simulated at the size that is found, at its best place with the synthetic robot's own "
-        "law too. Doubtful: the library's effect takes less than "
-        f"{percent(how['rehearsal'].get('known', 0.5))} of that, or another one takes more.",
+        "Then each effect was simulated at the size that is found; one whose law has a shape also with the law of the "
+        "synthetic robot. Doubtful: the library's effect takes less than "
+        f"{percent(how['rehearsal'].get('known', 0.5))} of that, or another one takes clearly more.",
         f"Recovered means that less than {percent(how['recovered_below'])} of the prior's width is left.",
     ]
     if not result.get("full"):
