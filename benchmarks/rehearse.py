@@ -22,6 +22,7 @@ import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
 import json  # noqa: E402
+import subprocess  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Callable, Mapping, Sequence  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
@@ -38,6 +39,7 @@ from droid_jax.discrepancy.candidates import observable_effects  # noqa: E402
 from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig  # noqa: E402
 from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
+from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
 from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
@@ -104,8 +106,20 @@ def _recorded(
     return as_recording(robot, trace, sensor_torque(robot, trace), trace.position)
 
 
-def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], FullRehearsal]:
-    """The quick rehearsal of a scene, kept, and what its complete ones share."""
+def door_by_command(runs: Path) -> dict[str, Any]:
+    """What the quick form takes on the built-in door, as a user calls it: seconds, and seconds of both cores; kept."""
+
+    def made() -> dict[str, Any]:
+        out = runs / "door_command"
+        subprocess.run([sys.executable, "-m", "droid_jax.run", "rehearse", "--out", str(out)], check=True, cwd=ROOT)
+        seconds = json.loads((out / "rehearsal.json").read_text())["seconds"]
+        return {"seconds": seconds["whole"], "cpu_seconds": seconds["cpu"], "code": CODE.get("git")}
+
+    return kept(runs / "door_command.json", made)
+
+
+def rehearsal_of(name: str, runs: Path, seed: int, full: bool) -> tuple[dict[str, Any], Scene, FullRehearsal | None]:
+    """The quick rehearsal of a scene, kept, the scene, and what its complete ones share where any are made."""
     where = setting(name, runs / "door")
     recordings = measured(where, seed)
     effects = observable_effects(where.scene, recordings, channels=CHANNELS)
@@ -123,18 +137,24 @@ def rehearsal_of(name: str, runs: Path, seed: int) -> tuple[dict[str, Any], Full
         return plain({**found, "code": CODE.get("git"), "whole_seconds": time.monotonic() - began})
 
     quick = kept(runs / f"quick_{name}_seed{seed}.json", made)
+    if not full:
+        return quick, where.scene, None
     identify = IdentifyConfig(search=search_config("quick", seed), refine=refine_config("quick"), samples=0)
     found = rehearsed(where.scene, where.base, effects, recordings, plan, config, rehearsal, step_error=False)
-    return quick, FullRehearsal(
-        where.scene, where.base, effects, tuple(recordings), plan, config, identify, rehearsal, found, seed
+    return (
+        quick,
+        where.scene,
+        FullRehearsal(
+            where.scene, where.base, effects, tuple(recordings), plan, config, identify, rehearsal, found, seed
+        ),
     )
 
 
-def asked(quick: Mapping[str, Any], of: FullRehearsal) -> list[dict[str, Any]]:
+def asked(quick: Mapping[str, Any], scene: Scene) -> list[dict[str, Any]]:
     """One place and coefficient of each effect that the synthetic robot has a law of its own for."""
     best: dict[str, dict[str, Any]] = {}
     for entry in quick["effects"]:
-        if entry["smallest"] is None or not hidden_case(of.scene, 0, entry, 1.0).hidden:
+        if entry["smallest"] is None or not hidden_case(scene, 0, entry, 1.0).hidden:
             continue
         known = best.get(entry["effect"])
         if known is None or entry["smallest"] < known["smallest"]:
@@ -155,10 +175,10 @@ def next_step(steps: Mapping[float, bool]) -> float | None:
     return rungs[above] if above < len(rungs) else None
 
 
-def cases_at(of: FullRehearsal, entry: Mapping[str, Any], index: int, times: float, seeds: int) -> list[HiddenCase]:
+def cases_at(scene: Scene, entry: Mapping[str, Any], index: int, times: float, seeds: int) -> list[HiddenCase]:
     """The cases of one effect at one size."""
     rung = LADDER.index(times)
-    return [hidden_case(of.scene, 1000 * seed + 100 * rung + index, entry, times) for seed in range(seeds)]
+    return [hidden_case(scene, 1000 * seed + 100 * rung + index, entry, times) for seed in range(seeds)]
 
 
 def kept_case(folder: Path, case: HiddenCase) -> dict[str, Any] | None:
@@ -168,7 +188,8 @@ def kept_case(folder: Path, case: HiddenCase) -> dict[str, Any] | None:
 
 
 def staircase(
-    of: FullRehearsal,
+    of: FullRehearsal | None,
+    scene: Scene,
     entry: Mapping[str, Any],
     index: int,
     arguments: Arguments,
@@ -179,9 +200,9 @@ def staircase(
     steps, made, seeds = dict[float, bool](), list[dict[str, Any]](), 1 if arguments.quick else arguments.seeds
     while (times := next_step(steps)) is not None:
         found = list[bool]()
-        for case in cases_at(of, entry, index, times, seeds):
+        for case in cases_at(scene, entry, index, times, seeds):
             result = kept_case(folder, case)
-            if result is None and not late():
+            if result is None and of is not None and not late():
                 with claimed(folder / case.name / "result.json", wait=True):
                     result = run_case(of, case, folder)
                 named = " + ".join(result["effects"]) or result["verdict"]
@@ -268,25 +289,29 @@ def main(arguments: Arguments) -> None:
     for scene in SCENES:
         if scene not in scenes and not (runs / f"quick_{scene}_seed{arguments.seed}.json").is_file():
             continue
-        quick, of = rehearsal_of(scene, runs, arguments.seed)
+        quick, model, of = rehearsal_of(scene, runs, arguments.seed, not arguments.sum_only)
         seconds[scene], cpu[scene] = quick["whole_seconds"], quick["seconds"]["cpu"]
 
         def late(scene: str = scene) -> bool:
             over = bool(arguments.minutes) and time.monotonic() - began > 60 * arguments.minutes
             return over or arguments.sum_only or scene not in scenes
 
-        entries = asked(quick, of)[: 1 if arguments.quick else None]
+        entries = asked(quick, model)[: 1 if arguments.quick else None]
         effects[scene] = []
         for index, entry in enumerate(entries):
             made = earlier_cases(arguments.earlier, scene, entry)
             if measured_size(entry, made) is None:
-                made += staircase(of, entry, index, arguments, runs / scene, late)
+                made += staircase(of, model, entry, index, arguments, runs / scene, late)
             case_seconds += [c["seconds"] for c in made]
             effects[scene].append(judged(entry, made))
-    whole = summary(effects)
+    whole, door = summary(effects), {}
+    if not arguments.quick and ("door" in scenes or (runs / "door_command.json").is_file()):
+        door = door_by_command(runs)
     result = {
         **whole,
-        "seconds_door": seconds.get("door"),
+        "seconds_door": door.get("seconds"),
+        "cpu_seconds_door": door.get("cpu_seconds"),
+        "code_door": door.get("code"),
         "seconds_quick": seconds,
         "cpu_seconds_quick": cpu,
         "seconds_case_median": float(np.median(case_seconds)) if case_seconds else None,

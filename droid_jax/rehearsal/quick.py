@@ -484,7 +484,7 @@ def law_checks(
 def _other_laws(
     found: Rehearsed, space: Space, known: Sequence[Mapping[str, Any]], config: DiscrepancyConfig
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """[M] of each effect with a shape, at its best place: what the synthetic robot's law adds to the training motion."""
+    """Of each effect with a shape, at its best place, what the synthetic robot's law adds to the training part, [M]."""
     recording, scene = found.roles["train"], found.case.train.cost.scene
     if not recording.command.size:
         return
