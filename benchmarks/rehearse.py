@@ -53,6 +53,7 @@ SCENES = ("hinge", "bench", "door")
 LADDER = (0.5, 0.7, 1.0, 1.4, 2.0)  # times the predicted size
 SEEDS = 1
 REPEATS = 10
+CLOSE = 0.99  # times the predicted size, from which a case counts as one at it
 FACTOR = 1.5  # a prediction that is off by less counts as right
 CHANNELS = ("torque",)
 
@@ -255,6 +256,7 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
         "found": {f"{t:g}": [int(sum(f)), len(f)] for t, f in rates.items()},
         "measured_over_predicted": None if ratio is None or not np.isfinite(ratio) else ratio,
         "not_found_at_twice": bool(ratio == np.inf),
+        "missed": any(t > CLOSE and not all(f) for t, f in rates.items()),
         "within": None if ratio is None else bool(1 / FACTOR <= ratio <= FACTOR),
         "answers": [c["sentence"] if "sentence" in c else c["error"] for c in cases],
     }
@@ -263,10 +265,10 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
 def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Shares over the effects whose smallest size is known.
 
-    Wrong advice: surely found, it said, and what was hidden at that size was not.
+    Wrong advice: surely found, it said, and something hidden at that size or above was not.
     """
     done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
-    wrong = [e["sure"] and not (e["measured_over_predicted"] or np.inf) <= 1.0 for e in done]
+    wrong = [e["sure"] and e["missed"] for e in done]
     sure = [e for e in done if e["sure"]]
     return {
         "effects": len(done),

@@ -333,11 +333,11 @@ def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[
 
 
 def test_advice_is_wrong_where_what_would_be_found_was_not():
-    usual = {"within": True, "not_found_at_twice": False}
+    usual = {"within": True, "not_found_at_twice": False, "missed": False}
     of = [
         {**usual, "sure": True, "measured_over_predicted": 0.7},
-        {**usual, "sure": True, "measured_over_predicted": 1.4},
-        {**usual, "sure": False, "measured_over_predicted": None, "not_found_at_twice": True, "within": False},
+        {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
+        {**usual, "sure": False, "missed": True, "not_found_at_twice": True, "within": False},
     ]
     told = summary({"hinge": of})
     assert told["wrong_advice_rate"] == pytest.approx(1 / 3) and told["within_factor"] == pytest.approx(2 / 3)
