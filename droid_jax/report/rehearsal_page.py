@@ -77,7 +77,8 @@ def _rivals(entry: Mapping[str, Any]) -> str:
     law = entry.get("law") or {}
     if law.get("other"):
         other = law["other"]
-        said.append(f"{label(other['effect']).lower()} at {label(other['location']).lower()} (another form of its law)")
+        why = "beyond small sizes" if law["law"] == "the library's" else "with another law"
+        said.append(f"{_thing(other)} ({why})")
     for rival in entry["taken_for"][:MOST_RIVALS]:
         name = f"{label(rival['effect']).lower()} at {label(rival['location']).lower()}"
         below = rival["below"]
@@ -141,7 +142,7 @@ def rehearsal_sentences(result: Result) -> list[str]:
     out = []
     if found:
         ranked = sorted([e for e in found if e["unit"] in KNOWN] or found, key=_multiple)
-        first, last = ranked[0], ranked[-1]
+        first, last = next((e for e in ranked if e["unit"] == "N m"), ranked[0]), ranked[-1]
         sentence = (
             f"With this motion {_thing(first)} would be found from {quantity(first['smallest'], first['unit'], 2)}"
         )
