@@ -224,6 +224,19 @@ class LinearModel:
         return self.added @ self.added.T
 
     @cached_property
+    def _beside(self) -> dict[bytes, tuple[np.ndarray, np.ndarray]]:
+        return {}
+
+    def beside(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[K, M] what base parameters free [D] leave of each sensitivity, and the products [K, K] of these."""
+        key = free.tobytes()
+        if key not in self._beside:
+            raw, held = np.nan_to_num(self.train.raw), self.held(self.slack)[free]
+            columns = project(raw, self.train.base[:, free], held)
+            self._beside[key] = columns, columns @ columns.T
+        return self._beside[key]
+
+    @cached_property
     def shaped(self) -> tuple[np.ndarray, ...]:
         """Indices of the directions of each candidate in each of its shapes."""
         groups: dict[object, list[int]] = {}
@@ -328,15 +341,15 @@ def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[Eff
 
     free: [D] base parameters that absorb.
     """
-    base, held = model.train.base[:, free], model.held(model.slack)[free]
-    columns = project(np.nan_to_num(model.train.raw), base, held)
+    columns, products = model.beside(free)
+    along = columns @ left
     whole, out = max(float(left @ left), 1e-30), dict[EffectKey, float]()
     for rows in model.shaped:
         key = model.directions[rows[0]].candidate.key
         low, high = np.where(model.low[rows] < 0, -np.inf, 0.0), np.where(model.high[rows] > 0, np.inf, 0.0)
-        gram, toward = columns[rows] @ columns[rows].T, columns[rows] @ left
-        coefficients = _within(gram, toward, low, high)
-        share = float(coefficients @ (2 * toward - gram @ coefficients)) / whole
+        gram = products[np.ix_(rows, rows)]
+        coefficients = _within(gram, along[rows], low, high)
+        share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
         out[key] = max(share, out.get(key, 0.0))
     return out
 
