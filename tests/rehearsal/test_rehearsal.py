@@ -333,7 +333,7 @@ def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[
 
 
 def test_advice_is_wrong_where_what_would_be_found_was_not():
-    usual = {"within": True, "not_found_at_twice": False, "missed": False}
+    usual = {"within": True, "not_found_at_twice": False, "missed": False, "found": {"1": [1, 1]}}
     of = [
         {**usual, "sure": True, "measured_over_predicted": 0.7},
         {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
