@@ -265,17 +265,17 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
 def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Shares over the effects whose smallest size is known.
 
-    Wrong advice: surely found, it said, and something hidden at that size or above was not.
+    Wrong advice, of what was surely found as it said: something hidden at that size or above was not.
     """
     done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
-    advised = [e for effects in by_scene.values() for e in effects if any(float(t) > CLOSE for t in e["found"])]
-    wrong = [e["sure"] and e["missed"] for e in advised]
+    every = [e for effects in by_scene.values() for e in effects if e["sure"]]
+    advised = [e for e in every if e["within"] is not None or any(float(t) > CLOSE for t in e["found"])]
     sure = [e for e in done if e["sure"]]
     return {
         "effects": len(done),
         "within_factor": float(np.mean([e["within"] for e in done])) if done else None,
         "advised": len(advised),
-        "wrong_advice_rate": float(np.mean(wrong)) if advised else None,
+        "wrong_advice_rate": float(np.mean([e["missed"] for e in advised])) if advised else None,
         "sure": len(sure),
         "within_factor_of_sure": float(np.mean([e["within"] for e in sure])) if sure else None,
         "unsure_not_found": sum(e["not_found_at_twice"] for e in done if not e["sure"]),
