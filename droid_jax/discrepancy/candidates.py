@@ -122,20 +122,27 @@ class ScoreTest:
         return np.argsort(-self.explained).tolist()
 
 
-def sensitivities(residual_set: ResidualSet, values: np.ndarray, directions: Sequence[ScoreDirection]) -> np.ndarray:
+def sensitivities(
+    residual_set: ResidualSet,
+    values: np.ndarray,
+    directions: Sequence[ScoreDirection],
+    at: Sequence[float] | None = None,
+) -> np.ndarray:
     """[K, M] what each coefficient adds to the simulation, per unit of it, in units of one repeat's noise.
 
-    values: [D] the fitted model.  One batch for all.  NaN where the replay blew up.
+    values: [D] the fitted model.  at: [K] how large each coefficient is made, from neutral on; None: small.  One batch
+    for all.  NaN where the replay blew up.
     """
     space = residual_set.cost.space
     rows, sizes = [values], []
-    for direction in directions:
+    for number, direction in enumerate(directions):
         row = values.copy()
         for name, value in direction.candidate.shape_parameters.items():
             row[space.index(name)] = value
         p = space[direction.coefficient]
         room = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
-        size = math.copysign(min(SMALL * p.std, 0.5 * abs(room)), room)
+        small = math.copysign(min(SMALL * p.std, 0.5 * abs(room)), room)
+        size = small if at is None else at[number]
         row[space.index(direction.coefficient)] = p.mean + size
         rows.append(row)
         sizes.append(size)

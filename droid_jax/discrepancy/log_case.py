@@ -159,7 +159,7 @@ def noise_of(
     case, model, deviation = _rough_fit(log, base, effects, start, block, config)
     found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
     whole = model.residuals.mean(axis=0)
-    least = _least(found, whole, log.space, config)
+    least = least_residual(found, whole, log.space, config)
     noise = least if least @ least < config.blocks.noise_share * (whole @ whole) else whole
     left, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in (noise, least))
     rate = config.compare.noise.rate
@@ -186,7 +186,7 @@ def _rough_fit(
     return case, base_model(case, values), deviation
 
 
-def _least(found: ScoreTest, left: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
+def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
     """[M] what the best `max_effects` candidates leave of residuals `left` [M], one after the other, linearly.
 
     One that takes less than an effect must is left out: it would take noise.

@@ -173,6 +173,11 @@ class DampedProblem:
         """
         points = np.stack([up, down])
         residual = self.replay(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:3], -1)
+        return self._apart(points, residual, state)
+
+    @staticmethod
+    def _apart(points: np.ndarray, residual: np.ndarray, state: Starts) -> tuple[np.ndarray, np.ndarray]:
+        """The same of points [2, S, N, D] and their residuals [2, S, N, M]."""
         failed = np.isnan(residual[..., :1])
         points = np.where(failed, state.x[:, None], points)
         residual = np.where(failed, state.residual[:, None], residual)
@@ -187,6 +192,16 @@ class DampedProblem:
         residual = self.replay(x)
         widths = np.full(x.shape, self._config.step)
         return Starts(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
+
+    def start_with_slopes(self, x: np.ndarray) -> tuple[Starts, np.ndarray]:
+        """`start` of one start [1, D] and its `jacobian` [1, M, D], of one batch of replays."""
+        widths = np.full(x.shape, self._config.step)
+        up, down = self._around(x, widths)
+        residual = self.replay(np.concatenate([x, up[0], down[0]]))
+        state = Starts(x, residual[:1], self.objective(x, residual[:1]), np.full(1, 1e-3), widths)
+        return state, self._slopes(
+            *self._apart(np.stack([up, down]), residual[1:].reshape(2, *up.shape[:2], -1), state)
+        )
 
     def step(self, state: Starts, held: np.ndarray | None = None) -> tuple[Starts, np.ndarray]:
         """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
@@ -211,9 +226,16 @@ class DampedProblem:
 
     def jacobian(self, state: Starts) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
-        steps = np.eye(state.x.shape[1]) * state.widths[:, None, :]
-        up, down = self.inside(state.x[:, None] + steps), self.inside(state.x[:, None] - steps)
-        spans, apart = self.differences(up, down, state)
+        return self._slopes(*self.differences(*self._around(state.x, state.widths), state))
+
+    def _around(self, x: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[S, D, D] a width up and down of starts [S, D] along each axis, within bounds."""
+        steps = np.eye(x.shape[1]) * widths[:, None, :]
+        return self.inside(x[:, None] + steps), self.inside(x[:, None] - steps)
+
+    @staticmethod
+    def _slopes(spans: np.ndarray, apart: np.ndarray) -> np.ndarray:
+        """[S, M, D] slopes of differences along each axis."""
         span = np.einsum("sii->si", spans)[..., None]
         return np.swapaxes(np.where(span > 0, apart / np.where(span > 0, span, 1.0), 0.0), 1, 2)
 

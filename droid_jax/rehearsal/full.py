@@ -7,7 +7,6 @@ the result says so.
 
 from __future__ import annotations
 
-import copy
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.cost.cost import followed
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import with_finer_step
@@ -25,80 +23,32 @@ from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.missing import search
 from droid_jax.errors import reason
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
-from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Role, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json
-from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.plan import RehearsalPlan, planned_recording, simulated_channels
-from droid_jax.rehearsal.quick import Rehearsed, hidden_directions
-from droid_jax.simulate.replay import Drive
-from droid_jax.simulate.servo_gains import scale_gains, servo_factors
+from droid_jax.rehearsal.plan import (
+    HiddenCase,
+    RehearsalPlan,
+    hidden_form,
+    planned_recording,
+    robot_trace,
+    simulated_channels,
+)
+from droid_jax.rehearsal.quick import Rehearsed, hidden_directions, robot_whitened
 from droid_jax.storage import write_json
-from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, check, record_hidden
-from droid_jax.synthetic.robot import SyntheticRobotConfig
 
 SPREAD = 0.5  # prior deviations by which parameters of interest are drawn
 FAR = 2.5  # prior deviations from which on a nuisance is drawn no further
 LEVEL = 0.9  # of the intervals that are judged
 TIMES = (1.0, 0.5, 2.0)  # of the size that the quick form predicts, in turns
 EMPTY = 5  # one case of so many has nothing hidden
-RATE = 1000.0  # Hz, of what the synthetic robot hands on before it is put onto the recording's clocks
 FARTHEST = 10.0  # times the library's size that an amplitude is taken to be, and the other way round
 RESULT = "result.json"
-
-
-@dataclass(frozen=True)
-class HiddenCase:
-    """One rehearsal: nothing hidden (effect ""), or an effect at a place, of some size of one coefficient.
-
-    size: of the library's coefficient.  times: of the size that the quick form predicts.
-    hidden: how the synthetic robot calls it; empty where the library's own law is simulated.
-    amplitude: of the synthetic robot's law, as strong in this motion as `size` (`equally_strong`).
-    form: share of what that law leaves that the library's form could take.
-    """
-
-    number: int
-    effect: str = ""
-    location: str = ""
-    coefficient: str = ""
-    shape: Mapping[str, float] | None = None
-    size: float = 0.0
-    times: float = 0.0
-    hidden: str = ""
-    joint: str = ""
-    amplitude: float = 0.0
-    form: float = 1.0
-
-    @property
-    def name(self) -> str:
-        """Of its folder."""
-        what = f"{self.effect}_{self.location}_{self.times:g}x" if self.effect else "nothing"
-        return f"{self.number:04d}_{''.join(c if c.isalnum() or c in '._-' else '_' for c in what)}"
-
-
-def hidden_form(scene: Scene, effect: str, location: str, unit: str) -> tuple[str, str]:
-    """What the synthetic robot calls an effect of the library at a place, and its joint; empty where it has none.
-
-    Where its amplitude has another unit than the library's coefficient it counts as none.
-    """
-    for name, library in LIBRARY.items():
-        on_hinge = ON_HINGE.get(library, library)
-        form = HIDDEN[name]
-        joint = location if form.on in ("arm", "joint") and location in (*scene.joints, scene.object_joint) else ""
-        called = on_hinge if joint and joint == scene.object_joint else library
-        if called != effect or form.unit.replace("²", "^2") != unit:
-            continue
-        try:
-            check(Applied(name, 0.0, joint), scene)
-        except ValueError:
-            continue
-        return name, joint
-    return "", ""
 
 
 def hidden_cases(
@@ -168,48 +118,8 @@ def synthetic_log(
             at[whole.index(name)] = value
         trace = simulated_channels(ready(scene), whole, effects, recording, at, config)
     else:
-        trace = _robot_trace(scene, space, recording, values, case, config, seed)
+        trace = robot_trace(scene, space, recording, values, case, config, seed)
     return planned_recording(scene, recording, trace, full, rehearsal, seed)[0]
-
-
-def _robot_trace(
-    scene: Scene,
-    space: Space,
-    recording: Recording,
-    values: np.ndarray,
-    case: HiddenCase,
-    config: DiscrepancyConfig,
-    seed: int,
-) -> Rollout:
-    """What the synthetic robot does, without noise, as a replay of one sample."""
-    quiet = SyntheticRobotConfig(
-        repeats=1, timestep=0.00025, rate=RATE, torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0,
-        angle_noise=0.0, angle_rate=RATE, start_noise=0.0, pose_noise=0.0, side=recording.torque.side,
-    )  # fmt: skip
-    drive = followed(scene, recording, config.compare)
-    assert isinstance(drive, Drive)
-    robot = replace(scene, model=scale_gains(copy.copy(scene.model), servo_factors(scene, drive)))
-    start = {**recording.measured_start(), **recording.qpos0}
-    hidden = [Applied(case.hidden, case.amplitude, case.joint)] if case.hidden else []
-    truth = {name: float(v) for name, v in zip(space.names, values, strict=True)}
-    log = record_hidden(
-        robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=quiet, space=space
-    )
-    time = log.channel("torque").time
-    position = log.channel("position").values[0].astype(float)
-    angle = np.zeros(len(time))
-    if "object_angle" in log.channels:
-        seen = log.channel("object_angle")
-        angle = np.interp(time, seen.time, seen.values[0, :, 0])
-    return Rollout(
-        time=time - recording.time[0],
-        torque=log.channel("torque").values[0].astype(float),
-        position=position,
-        velocity=np.gradient(position, time, axis=0),
-        object_angle=angle,
-        contact=np.zeros((len(time), 0), bool),
-        finite=np.array(True),
-    )
 
 
 def equally_strong(
@@ -222,20 +132,14 @@ def equally_strong(
     """
     if not case.hidden or not found.model.repeated:
         return case
-    model, comparison, scene = found.model, found.case.train.comparison, found.case.train.cost.scene
-    known = found.base.values[found.case.full_space.columns(space)]
+    model = found.model
 
-    def whitened(of: HiddenCase) -> np.ndarray:
-        trace = _robot_trace(scene, space, recording, known, of, config, 0)
-        clock = comparison.clock - comparison.clock[0]
-        fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
-        angle = np.interp(clock, trace.time, trace.object_angle)
-        on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
-        return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
-
+    hidden, nothing = robot_whitened(found, space, recording, [case, HiddenCase(0)], config)
+    if hidden is None or nothing is None:
+        return case
     seen = np.isin(model.train.channel, found.compared)
     part = model.of(found.compared)
-    left = project((whitened(case) - whitened(HiddenCase(0)))[None, seen], part.train.base, part.held(part.slack))[0]
+    left = project((hidden - nothing)[None, seen], part.train.base, part.held(part.slack))[0]
     sensitivities, best = part.projected(), 0.0
     groups: dict[object, list[int]] = {}
     for k, direction in enumerate(part.directions):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.stats
@@ -19,6 +19,9 @@ from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
 from droid_jax.model.effects.candidate import EffectKey
+
+FAR = 1e3  # deviations of the noise: more than any test asks for
+POINTS = 24  # sizes at which each piece of what is left of a direction is worked out
 
 
 def _assumed() -> dict[str, float]:
@@ -40,6 +43,7 @@ class RehearsalConfig:
       position and camera are those of a Panda.
     margin: times what the linear model predicts that a size must be; of ten effects on a lone hinge four were found at
       1.4 times that and not at it, since another robot's parameters and law are not quite the linear ones.
+    known: share of what is left of an effect that the library's own must take, for it to be said to be found.
     faster: how many times as fast the other motion is.
     seed: of the draws.
     """
@@ -52,6 +56,7 @@ class RehearsalConfig:
     pooling: float = 12.0
     noise: dict[str, float] = field(default_factory=_assumed)
     margin: float = 1.4
+    known: float = 0.5
     faster: float = 1.5
     seed: int = 0
 
@@ -65,6 +70,7 @@ class RehearsalConfig:
             pooling=partial(number, above=0),
             noise=weights,
             margin=partial(number, least=1),
+            known=partial(number, least=0, below=1),
             faster=partial(number, above=0),
             seed=partial(whole, least=0),
         )
@@ -100,6 +106,11 @@ class LinearPart:
         each = (None if a is None else a[kept] for a in (self.step, self.residual, self.column))
         return LinearPart(self.raw[:, kept], self.base[kept], rows, self.channel[kept], self.level, *each)
 
+    def quieter(self, share: float) -> LinearPart:
+        """The same with so much of its residual, of blocks."""
+        assert self.residual is not None
+        return replace(self, residual=share * self.residual, level=share**2 * self.level)
+
     def noise(self, draws: int, rng: np.random.Generator) -> np.ndarray:
         """[R, M] drawn noise of one log: the base residual with other phases, column by column, where it counts.
 
@@ -127,6 +138,7 @@ class LinearModel:
     fit, search units.  slack: times these that the score test lets parameters move.  repeats: N that are rehearsed; of
     blocks how many times the recording's own length, times its blocks.
     minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
+    base_low, base_high: [D] by how much the base parameters may move, search units; None: without bounds.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -138,6 +150,8 @@ class LinearModel:
     minimum: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    base_low: np.ndarray | None = None
+    base_high: np.ndarray | None = None
 
     @property
     def room(self) -> np.ndarray:
@@ -158,6 +172,14 @@ class LinearModel:
         """The same with some channels compared."""
         return replace(self, train=self.train.of(channels), validation=self.validation.of(channels))
 
+    def alone(self, rows: Sequence[int]) -> LinearModel:
+        """Of some directions, with the training part as validation part too."""
+        some = np.array(rows, int)
+        train = replace(self.train, raw=self.train.raw[some])
+        directions = tuple(self.directions[k] for k in some)
+        minimum, low, high = (a[some] for a in (self.minimum, self.low, self.high))
+        return replace(self, directions=directions, train=train, validation=train, minimum=minimum, low=low, high=high)
+
     @property
     def step_error(self) -> float:
         """U0: what the base parameters cannot absorb of a finer time step's difference."""
@@ -170,16 +192,171 @@ class LinearModel:
         """[K, M] sensitivities of the training part, as the score test has them."""
         return project(self.train.raw, self.train.base, self.held(self.slack))
 
+    @cached_property
+    def absorbed(self) -> np.ndarray:
+        """[D, K] by how much a unit moves the base parameters that are fitted to the training part, without bounds."""
+        base, held = self.train.base, self.held(1.0)
+        return np.linalg.solve(base.T @ base + np.diag(held**-2), base.T @ np.nan_to_num(self.train.raw).T)
+
+    def inside(self, moved: np.ndarray) -> bool:
+        """Whether base parameters that moved by so much [D] are within their bounds."""
+        if self.base_low is None or self.base_high is None:
+            return True
+        return bool(np.all((moved >= self.base_low) & (moved <= self.base_high)))
+
     def unabsorbed(self) -> np.ndarray:
         """[K, M] what a unit adds to the validation part once the base is fitted to the training part."""
-        base, held = self.train.base, self.held(1.0)
-        normal = base.T @ base + np.diag(held**-2)
-        absorbed = np.linalg.solve(normal, base.T @ self.train.raw.T)  # [D, K]
-        return self.validation.raw - (self.validation.base @ absorbed).T
+        return self.validation.raw - (self.validation.base @ self.absorbed).T
+
+    @cached_property
+    def loosest(self) -> np.ndarray:
+        """[K, M] what the base parameters, with their priors alone, leave of each sensitivity."""
+        return project(np.nan_to_num(self.train.raw), self.train.base, self.held(1.0))
+
+    @cached_property
+    def added(self) -> np.ndarray:
+        """[K, M] `unabsorbed`, zero where a replay blew up."""
+        return np.nan_to_num(self.unabsorbed())
+
+    @cached_property
+    def products(self) -> np.ndarray:
+        """[K, K] products of the rows of `added`."""
+        return self.added @ self.added.T
+
+    @cached_property
+    def _beside(self) -> dict[bytes, tuple[np.ndarray, np.ndarray]]:
+        return {}
+
+    def beside(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[K, M] what base parameters free [D] leave of each sensitivity, and the products [K, K] of these."""
+        key = free.tobytes()
+        if key not in self._beside:
+            raw, held = np.nan_to_num(self.train.raw), self.held(self.slack)[free]
+            columns = project(raw, self.train.base[:, free], held)
+            self._beside[key] = columns, columns @ columns.T
+        return self._beside[key]
+
+    @cached_property
+    def shaped(self) -> tuple[np.ndarray, ...]:
+        """Indices of the directions of each candidate in each of its shapes."""
+        groups: dict[object, list[int]] = {}
+        for k, direction in enumerate(self.directions):
+            groups.setdefault(direction.candidate.shaped_key, []).append(k)
+        return tuple(map(np.array, groups.values()))
 
     def held(self, slack: float) -> np.ndarray:
         """[D] prior deviations beside the residual of one repeat, or of the whole log."""
         return self.prior * slack * (self.repeats**0.5 if self.repeated else 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """What the base parameters leave of one direction, as its size grows.
+
+    begins: [P] sizes at which one more of the parameters has come to a bound, the first 0.
+    train, validation: [P, 2, M] of each piece what is left at size 0 and what each unit adds: of the score test's
+      residual, and on the validation part of a model that was fitted without the effect.
+    free: [P, D] bool, the parameters that are not at a bound.  room: the largest size.
+    """
+
+    begins: np.ndarray
+    train: np.ndarray
+    validation: np.ndarray
+    free: np.ndarray
+    room: float
+
+    def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
+        """[M] of the training part, and of the validation part."""
+        piece = max(int(np.searchsorted(self.begins, size, side="right")) - 1, 0)
+        of = np.array([1.0, size])
+        return of @ self.train[piece], of @ self.validation[piece]
+
+    @cached_property
+    def norms(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sizes, and how large what is left is on each part at these; never smaller than at a smaller size."""
+        slope = max(float(np.linalg.norm(self.train[-1, 1])), 1e-30)
+        ends = np.append(self.begins[1:], max(min(self.room, FAR / slope), 2 * self.begins[-1]))
+        sizes = np.concatenate([np.linspace(a, b, POINTS) for a, b in zip(self.begins, ends, strict=True)])
+        pieces = np.repeat(np.arange(len(ends)), POINTS)
+        out = []
+        for part in (self.train, self.validation):
+            gram = np.einsum("pam,pbm->pab", part, part)[pieces]
+            squares = gram[:, 0, 0] + 2 * sizes * gram[:, 0, 1] + sizes**2 * gram[:, 1, 1]
+            out.append(np.maximum.accumulate(np.sqrt(np.maximum(squares, 0.0))))
+        return sizes, *out
+
+    def size_of(self, norm: np.ndarray, validation: bool = False) -> np.ndarray:
+        """Sizes from which so much is left; inf where none within the effect's bounds leaves it."""
+        sizes, *both = self.norms
+        known = both[int(validation)]
+        return np.where(norm <= known[-1], np.interp(norm, known, sizes), np.inf)
+
+
+def leftover(model: LinearModel, k: int) -> Leftover:
+    """What the base parameters leave of direction k (`leftover_of`)."""
+    raw, other = (model.sign[k] * part.raw[k] for part in (model.train, model.validation))
+    return leftover_of(model, raw, other, float(model.room[k]))
+
+
+def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, room: float) -> Leftover:
+    """What the base parameters leave of something that adds raw [M] to the training part and other [M] to the other.
+
+    They are fitted to it with their priors and within their bounds, along the way on which one after the other stops at
+    a bound: a nuisance that could stand for all of an effect does so only as far as it may move.
+    """
+    train, validation = model.train, model.validation
+    held, loose = model.held(1.0), model.held(model.slack)
+    count = len(model.prior)
+    low = np.full(count, -np.inf) if model.base_low is None else np.minimum(model.base_low, 0.0)
+    high = np.full(count, np.inf) if model.base_high is None else np.maximum(model.base_high, 0.0)
+    normal, toward = train.base.T @ train.base + np.diag(held**-2), train.base.T @ raw
+    free, at, begins = np.ones(count, bool), np.zeros(count), [0.0]
+    pieces, frees = list[tuple[np.ndarray, np.ndarray]](), list[np.ndarray]()
+    while True:
+        frees.append(free.copy())
+        there, grows = at.copy(), np.zeros(count)
+        inside = normal[np.ix_(free, free)]
+        there[free] = np.linalg.solve(inside, -normal[np.ix_(free, ~free)] @ at[~free]) if free.any() else 0.0
+        grows[free] = np.linalg.solve(inside, toward[free]) if free.any() else 0.0
+        moves = np.stack([there, grows])
+        left = np.stack([np.zeros(len(raw)), raw]) - moves @ train.base.T
+        beside = np.stack([np.zeros(len(other)), other]) - moves @ validation.base.T
+        pieces.append((project(left, train.base[:, free], loose[free]), beside))
+        bound = np.where(grows > 0, high, low)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reached = np.where(grows != 0, (bound - there) / grows, np.inf)
+        reached[~free] = np.inf
+        reached = np.where(reached > begins[-1] * (1 + 1e-9), reached, np.inf)
+        k_next = int(np.argmin(reached)) if count else 0
+        if not count or not reached[k_next] < room:
+            break
+        free[k_next], at[k_next] = False, bound[k_next]
+        begins.append(float(reached[k_next]))
+    left, beside = (np.stack(part) for part in zip(*pieces, strict=True))
+    return Leftover(np.array(begins), left, beside, np.array(frees), room)
+
+
+def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[EffectKey, float]:
+    """Share of the square of a training residual [M] that each candidate takes linearly, in its best shape.
+
+    free: [D] base parameters that absorb.
+    """
+    columns, products = model.beside(free)
+    along = columns @ left
+    whole, out = max(float(left @ left), 1e-30), dict[EffectKey, float]()
+    for rows in model.shaped:
+        key = model.directions[rows[0]].candidate.key
+        low, high = np.where(model.low[rows] < 0, -np.inf, 0.0), np.where(model.high[rows] > 0, np.inf, 0.0)
+        gram = products[np.ix_(rows, rows)]
+        coefficients = _within(gram, along[rows], low, high)
+        share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
+        out[key] = max(share, out.get(key, 0.0))
+    return out
+
+
+def distinguishable(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
+    """Squared noncentrality that must stand between two models for the search to distinguish them."""
+    return _needed(model, config, share)
 
 
 @dataclass(frozen=True)
@@ -240,27 +417,31 @@ def imitations(model: LinearModel, k: int, size: float | None = None) -> list[Im
 
     size: of the effect, at which bounds of the others count; None: only their signs do.
     """
-    added = np.nan_to_num(model.unabsorbed())
-    target = model.sign[k] * added[k]
-    whole = float(target @ target)
-    if whole <= 0:
+    own, times = model.directions[k].candidate.key, size or 1.0
+    free = times * model.sign[k] * model.added[k]
+    targets = [free] if size is None or model.base_low is None else [free, leftover(model, k).at(size)[1]]
+    alongs = [model.added @ target for target in targets]
+    if min(float(target @ target) for target in targets) <= 0:
         return []
-    groups: dict[EffectKey, list[int]] = {}
-    for i, direction in enumerate(model.directions):
-        if direction.candidate.key != model.directions[k].candidate.key:
-            groups.setdefault(direction.candidate.shaped_key, []).append(i)
     best: dict[EffectKey, Imitation] = {}
-    for rows in groups.values():
+    for rows in model.shaped:
+        key = model.directions[rows[0]].candidate.key
+        if key == own:
+            continue
         low, high = model.low[rows], model.high[rows]
         if size is None:
             low, high = np.where(low < 0, -np.inf, 0.0), np.where(high > 0, np.inf, 0.0)
-        taken, coefficients = _taken(added[rows], (size or 1.0) * target, low, high)
-        least = model.minimum[rows] / np.maximum(np.abs(coefficients) / (size or 1.0), 1e-30)
-        strength = whole * (model.repeats if model.repeated else 1)
-        key = model.directions[rows[0]].candidate.key
-        found = Imitation(key, taken / ((size or 1.0) ** 2 * whole), strength, float(least.min()))
-        if key not in best or found.share > best[key].share:
-            best[key] = found
+        gram = model.products[np.ix_(rows, rows)]
+        for tried, along in zip(targets, alongs, strict=True):
+            coefficients, whole = _within(gram, along[rows], low, high), float(tried @ tried)
+            moved = times * model.sign[k] * model.absorbed[:, k] - model.absorbed[:, rows] @ coefficients
+            if size is None or model.inside(moved):
+                break  # beside this candidate the base parameters may take what is left
+        share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
+        if key not in best or share > best[key].share:
+            least = model.minimum[rows] / np.maximum(np.abs(coefficients) / times, 1e-30)
+            strength = whole / times**2 * (model.repeats if model.repeated else 1)
+            best[key] = Imitation(key, share, strength, float(least.min()))
     return list(best.values())
 
 
@@ -277,16 +458,27 @@ def unhindered(model: LinearModel, k: int, share: float) -> float:
     )
 
 
-def _taken(columns: np.ndarray, target: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, np.ndarray]:
-    """What coefficients with columns [C, M] within bounds take of the square of a target [M], and they [C]."""
-    seen, coefficients = np.linalg.norm(columns, axis=1) > 1e-12, np.zeros(len(columns))
-    if not seen.any():
-        return 0.0, coefficients
-    q, triangle = np.linalg.qr(columns[seen].T)
-    bounds = (low[seen] - 1e-12, high[seen] + 1e-12)
-    coefficients[seen] = lsq_linear(triangle, q.T @ target, bounds=bounds).x
-    left = target - columns.T @ coefficients
-    return float(target @ target - left @ left), coefficients
+def _within(gram: np.ndarray, toward: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[C] coefficients within bounds that take most of the square of a target.
+
+    gram: [C, C] products of their columns.  toward: [C] products of the columns and the target.
+    """
+    seen, coefficients = np.diag(gram) > 1e-24, np.zeros(len(toward))
+    count = int(seen.sum())
+    if not count:
+        return coefficients
+    gram, toward, low, high = gram[np.ix_(seen, seen)], toward[seen], low[seen], high[seen]
+    scale = 1.0 / np.sqrt(np.diag(gram))
+    gram = scale[:, None] * gram * scale + 1e-12 * np.eye(count)
+    free = scale * (np.linalg.solve(gram, scale * toward) if count > 1 else scale * toward)
+    if count == 1:
+        free = np.clip(free, low, high)
+    elif np.any((free < low) | (free > high)):
+        factor = np.linalg.cholesky(gram)
+        bounds = ((low - 1e-12) / scale, (high + 1e-12) / scale)
+        free = scale * lsq_linear(factor.T, np.linalg.solve(factor, scale * toward), bounds=bounds).x
+    coefficients[seen] = free
+    return coefficients
 
 
 def _needed(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,8 +23,13 @@ from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
 from droid_jax.rehearsal.linear import RehearsalConfig
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.servo_gains import scale_gains, servo_factors
+from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, check, record_hidden
+from droid_jax.synthetic.robot import SyntheticRobotConfig
 
 RATE = 200.0  # Hz, of channels that nobody measured
+FINE_RATE = 1000.0  # Hz, of what the synthetic robot hands on before it is put onto the recording's clocks
 SMOOTH = 0.1  # of the assumed noise, below which a channel of one repeat is taken to be no measurement
 ColumnNoise = tuple[str, str, str, float, str]  # channel, column, unit, deviation of one sample, where it comes from
 
@@ -56,13 +62,15 @@ def simulated_channels(
     recording: Recording,
     values: np.ndarray,
     config: DiscrepancyConfig,
+    engine: str = "mjx",
 ) -> Rollout:
     """What the replay makes of a recording's commands at values [D], without noise: one sample, host arrays [T, ...].
 
-    Its times count from the recording's first command.
+    Its times count from the recording's first command.  engine: "mjx", or "mujoco" for plain C (ValueError where it
+    lacks something).
     """
     drive = followed(scene, recording, config.compare)
-    replay = compiled_replay("mjx", scene, space, drive, effects)
+    replay = compiled_replay(engine, scene, space, drive, effects)
     rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
     if not bool(rollout.finite):
         raise ValueError(
@@ -200,3 +208,93 @@ def faster_motion(recording: Recording, factor: float) -> Recording:
         return np.minimum(factor * new, duration)
 
     return time_scaled(recording, TimeScaling(f"{recording.name}, {factor:g} times as fast", lambda d: d, clock))
+
+
+@dataclass(frozen=True)
+class HiddenCase:
+    """One rehearsal: nothing hidden (effect ""), or an effect at a place, of some size of one coefficient.
+
+    size: of the library's coefficient.  times: of the size that the quick form predicts.
+    hidden: how the synthetic robot calls it; empty where the library's own law is simulated.
+    amplitude: of the synthetic robot's law, as strong in this motion as `size` (`equally_strong`).
+    form: share of what that law leaves that the library's form could take.
+    """
+
+    number: int
+    effect: str = ""
+    location: str = ""
+    coefficient: str = ""
+    shape: Mapping[str, float] | None = None
+    size: float = 0.0
+    times: float = 0.0
+    hidden: str = ""
+    joint: str = ""
+    amplitude: float = 0.0
+    form: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        what = f"{self.effect}_{self.location}_{self.times:g}x" if self.effect else "nothing"
+        return f"{self.number:04d}_{''.join(c if c.isalnum() or c in '._-' else '_' for c in what)}"
+
+
+def hidden_form(scene: Scene, effect: str, location: str, unit: str) -> tuple[str, str]:
+    """What the synthetic robot calls an effect of the library at a place, and its joint; empty where it has none.
+
+    Where its amplitude has another unit than the library's coefficient it counts as none.
+    """
+    for name, library in LIBRARY.items():
+        on_hinge = ON_HINGE.get(library, library)
+        form = HIDDEN[name]
+        joint = location if form.on in ("arm", "joint") and location in (*scene.joints, scene.object_joint) else ""
+        called = on_hinge if joint and joint == scene.object_joint else library
+        if called != effect or form.unit.replace("²", "^2") != unit:
+            continue
+        try:
+            check(Applied(name, 0.0, joint), scene)
+        except ValueError:
+            continue
+        return name, joint
+    return "", ""
+
+
+def robot_trace(
+    scene: Scene,
+    space: Space,
+    recording: Recording,
+    values: np.ndarray,
+    case: HiddenCase,
+    config: DiscrepancyConfig,
+    seed: int,
+) -> Rollout:
+    """What the synthetic robot does, without noise, as a replay of one sample."""
+    quiet = SyntheticRobotConfig(
+        repeats=1, timestep=0.00025, rate=FINE_RATE, torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0),
+        position_noise=0.0, angle_noise=0.0, angle_rate=FINE_RATE, start_noise=0.0, pose_noise=0.0,
+        side=recording.torque.side,
+    )  # fmt: skip
+    drive = followed(scene, recording, config.compare)
+    assert isinstance(drive, Drive)
+    robot = replace(scene, model=scale_gains(copy.copy(scene.model), servo_factors(scene, drive)))
+    start = {**recording.measured_start(), **recording.qpos0}
+    hidden = [Applied(case.hidden, case.amplitude, case.joint)] if case.hidden else []
+    truth = {name: float(v) for name, v in zip(space.names, values, strict=True)}
+    log = record_hidden(
+        robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=quiet, space=space
+    )
+    time = log.channel("torque").time
+    position = log.channel("position").values[0].astype(float)
+    angle = np.zeros(len(time))
+    if "object_angle" in log.channels:
+        seen = log.channel("object_angle")
+        angle = np.interp(time, seen.time, seen.values[0, :, 0])
+    return Rollout(
+        time=time - recording.time[0],
+        torque=log.channel("torque").values[0].astype(float),
+        position=position,
+        velocity=np.gradient(position, time, axis=0),
+        object_angle=angle,
+        contact=np.zeros((len(time), 0), bool),
+        finite=np.array(True),
+    )

@@ -15,11 +15,12 @@ import scipy.stats
 from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
-from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, unhindered
+from droid_jax.rehearsal.linear import Leftover, LinearModel, RehearsalConfig, leftover, unhindered
 
 LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for
 HALVINGS = 8
-CHUNK = 4e6  # numbers of a batch of flips
+USUAL = 7.0  # noncentrality that a score test over many directions asks for, more or less
+BESIDE = 0.05  # cosine below which a direction's score is taken not to see another one
 
 
 @dataclass(frozen=True)
@@ -49,38 +50,60 @@ def smallest_sizes(
         selection: the search's thresholds.
     """
     selection = selection or SelectionConfig()
-    scores, gains = score_draws(model, config), gain_draws(model, config)
-    size = np.linalg.norm(scores.projected, axis=1)
     units = model.repeats**0.5 if model.repeated else 1.0
-    out = []
-    for k in wanted:
-        strength = float(size[k]) * units  # noncentrality of a unit
-        if strength < 1e-12:
+    left = [leftover(model, k) for k in wanted]
+    about = np.array([_about(of, units) for of in left])
+    rows = [of.at(size) for of, size in zip(left, about, strict=True)]
+    scores = score_draws(model, config, np.array([train for train, _ in rows]).reshape(len(rows), -1))
+    spread, out = fit_deviations(model, config), list[Smallest]()
+    for i, (k, of) in enumerate(zip(wanted, left, strict=True)):
+        if not np.isfinite(spread[k]) or of.norms[1][-1] < 1e-12:
             out.append(Smallest(np.inf, {}, "no signal", np.nan))
             continue
-        spread = max(float(scipy.stats.norm.ppf(config.share)), 0.0) / strength  # of the fitted size
+        often = max(float(scipy.stats.norm.ppf(config.share)), 0.0)
+        surely = float(scipy.stats.norm.ppf(0.5 * (1 + selection.interval_level)))
         drawn = {
-            "score test": scores.crossings(k, selection.significance) / strength,
-            "validation": gains.crossings(k, selection),
-            "time step": discrepancy_crossings(model, k, strength, gains, config),
+            "score test": of.size_of(scores.crossings(i, selection.significance) / units),
+            "validation": of.size_of(gain_crossings(model, i, rows[i][1], config, selection), validation=True),
+            "time step": discrepancy_crossings(model, k, of, config),
         }
         fixed = {
-            "minimum effect size": float(model.minimum[k]) + spread,
+            "minimum effect size": float(model.minimum[k]) + often * spread[k],
+            "interval": (surely + often) * spread[k],
             "weak imitation": unhindered(model, k, config.share),
         }
         limits = {name: float(np.quantile(a, config.share, method="higher")) for name, a in drawn.items()} | fixed
         each = np.maximum(np.max(list(drawn.values()), axis=0), max(fixed.values()))
         found = config.margin * float(np.quantile(each, config.share, method="higher"))
         limit = max(limits, key=limits.__getitem__)
-        if found > model.room[k]:
+        if not found <= model.room[k]:
             found, limit = np.inf, "beyond its bounds"
-        out.append(Smallest(found, limits, limit, found * strength))
+        noncentrality = units * float(np.interp(found, *of.norms[:2])) if np.isfinite(found) else np.inf
+        out.append(Smallest(found, limits, limit, noncentrality))
     return out
 
 
-def discrepancy_crossings(
-    model: LinearModel, k: int, strength: float, gains: GainDraws, config: RehearsalConfig
-) -> np.ndarray:
+def fit_deviations(model: LinearModel, config: RehearsalConfig) -> np.ndarray:
+    """[K] by how much noise moves the fitted size of each coefficient, beside all base parameters; inf without signal.
+
+    That of blocks is not white: it is drawn.
+    """
+    sensitivities = model.loosest
+    size = np.linalg.norm(sensitivities, axis=1)
+    noise = np.full(len(size), model.repeats**-0.5)
+    if not model.repeated:
+        drawn = model.train.noise(config.draws, np.random.default_rng([config.seed, 4]))
+        noise = np.std(drawn @ _units(sensitivities).T, axis=0)
+    return np.where(size * model.repeats**0.5 > 1e-12, noise / np.maximum(size, 1e-30), np.inf)
+
+
+def _about(of: Leftover, units: float) -> float:
+    """The size at which a direction has the noncentrality that a score test asks for, more or less."""
+    size = float(of.size_of(np.array(USUAL / units)))
+    return size if np.isfinite(size) else float(of.norms[0][-1])
+
+
+def discrepancy_crossings(model: LinearModel, k: int, of: Leftover, config: RehearsalConfig) -> np.ndarray:
     """[R] size of direction k from which U is above what the time step leaves, on both parts.
 
     U is estimated: with noncentrality l, N M U is (l + g)^2 and the products of M residuals of noise, whose deviation
@@ -89,39 +112,33 @@ def discrepancy_crossings(
     if not model.repeated:
         return np.zeros(config.draws)
     rng, count, step_error = np.random.default_rng([config.seed, 3, k]), model.repeats, model.step_error
-    sizes = (strength, float(np.linalg.norm(gains.added[k])) * count**0.5)
     out = np.zeros(config.draws)
-    for part, factor, unit in zip((model.train, model.validation), (WORST, 1.0), sizes, strict=True):
+    for part, factor, validation in ((model.train, WORST, False), (model.validation, 1.0, True)):
         residuals = float(part.rows.counted.sum())
         along, beside = rng.normal(size=(2, config.draws))
         least = count * residuals * factor * step_error - np.sqrt(2 * residuals) * beside
         needed = np.sqrt(np.maximum(along**2 + least, 0.0)) - along
-        out = np.maximum(out, np.maximum(needed, 0.0) / max(unit, 1e-30))
+        out = np.maximum(out, of.size_of(np.maximum(needed, 0.0) / count**0.5, validation))
     return out
+
+
+Rejects = Callable[[np.ndarray], np.ndarray]  # noncentralities [R] -> [R] bool, whether each draw's test rejects
 
 
 @dataclass(frozen=True, eq=False)
 class ScoreDraws:
     """Scores of drawn noise, and the score test on them.
 
-    projected: [K, M] sensitivities.  shown: representatives of the K directions.
-    own: direction -> [R, S, N] noise of the scores of the representatives and of itself, and what a unit of its
-    noncentrality adds to them.  p_values: such scores and the S directions -> [R] p of the largest.
+    tests: number of an asked direction and a significance -> the test, as its noncentrality grows.  draws: R.
     """
 
-    projected: np.ndarray
-    shown: np.ndarray
-    own: Callable[[int], tuple[np.ndarray, np.ndarray]]
-    p_values: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    tests: Callable[[int, float], Rejects]
+    draws: int
 
     def crossings(self, k: int, significance: float) -> np.ndarray:
-        """[R] noncentrality of direction k from which each draw's score test rejects; inf where none does."""
-        noise, added = self.own(k)
-
-        def rejects(strength: np.ndarray) -> np.ndarray:
-            return self.p_values(noise + strength[:, None, None] * added, np.r_[self.shown, k]) < significance
-
-        low, high = np.full(len(noise), np.log(LEAST)), np.full(len(noise), np.log(MOST))
+        """[R] noncentrality of asked direction k from which each draw's score test rejects; inf where none does."""
+        rejects = self.tests(k, significance)
+        low, high = np.full(self.draws, np.log(LEAST)), np.full(self.draws, np.log(MOST))
         ends = rejects(np.exp(high))
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
@@ -139,16 +156,20 @@ def representatives(unit: np.ndarray, close: float) -> np.ndarray:
     return np.array(kept, int)
 
 
-def score_draws(model: LinearModel, config: RehearsalConfig) -> ScoreDraws:
-    """Noise of the score test of a linear model, drawn `config.draws` times."""
-    rows, projected = model.train.rows, np.nan_to_num(model.projected())
-    size = np.maximum(np.linalg.norm(projected, axis=1), 1e-30)
-    unit = np.where(size[:, None] > 1e-12, projected / size[:, None], 0.0)
-    shown, rng = representatives(unit, config.close), np.random.default_rng([config.seed, 1])
+def score_draws(model: LinearModel, config: RehearsalConfig, asked: np.ndarray) -> ScoreDraws:
+    """Noise of the score test of a linear model, drawn `config.draws` times; asked: [A, M] what effects leave."""
+    rows, unit = model.train.rows, _units(np.concatenate([np.nan_to_num(model.projected()), asked]))
+    shown, rng = representatives(unit[: -len(asked)], config.close), np.random.default_rng([config.seed, 1])
     if isinstance(rows, Repeats):
-        return _of_repeats(model, unit, projected, shown, rng, config)
+        return _of_repeats(model, unit, len(asked), shown, rng, config)
     assert isinstance(rows, Blocks)
-    return _of_blocks(model, rows, unit, projected, shown, rng, config)
+    return _of_blocks(model, rows, unit, len(asked), shown, rng, config)
+
+
+def _units(vectors: np.ndarray) -> np.ndarray:
+    """Rows of length one, or zero."""
+    size = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+    return np.where(size > 1e-12, vectors / size, 0.0)
 
 
 def scatter(rows: Repeats, unit: np.ndarray, pooling: float) -> np.ndarray:
@@ -171,11 +192,15 @@ def scatter(rows: Repeats, unit: np.ndarray, pooling: float) -> np.ndarray:
 def _of_repeats(
     model: LinearModel,
     unit: np.ndarray,
-    projected: np.ndarray,
+    asked: int,
     shown: np.ndarray,
     rng: np.random.Generator,
     config: RehearsalConfig,
 ) -> ScoreDraws:
+    """As `statistics.largest_detrended_t`, whose t grows with the share of its mean in a row's mean square.
+
+    An effect adds a constant to a row, so a flipped mean is linear in it, and is worked out once for all sizes.
+    """
     count, rows = model.repeats, model.train.rows
     assert isinstance(rows, Repeats)
     deviation = scatter(rows, unit, config.pooling)
@@ -184,33 +209,49 @@ def _of_repeats(
     kept = value > 1e-9 * max(value.max(initial=0.0), 1e-30)
     root = deviation[:, None] * vector[:, kept] * np.sqrt(value[kept])  # [K, r]
     drawn = rng.normal(size=(config.draws, int(kept.sum()), count))
-    flips = sign_flips(count, config.seed)[: config.flips].astype(np.float32)
+    flips = sign_flips(count, config.seed)[: config.flips]
+    balance = flips.mean(axis=1)[:, None, None].astype(np.float32)
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
 
-    def p_values(scores: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """[R] as `statistics.largest_detrended_t` has them, of scores [R, S, N]."""
-        straight = np.moveaxis(detrended(np.moveaxis(scores, 2, 0)), 0, 2).astype(np.float32)
-        out = []
-        for part in np.array_split(straight, max(1, int(straight.size * len(flips) / count / CHUNK))):
-            t = np.abs(t_values(part.reshape(-1, count), flips)).reshape(len(flips), len(part), -1).max(axis=2)
-            found = flipped.isf(own.sf(t[0]))
-            out.append(np.mean(t >= found * (1 - 1e-12), axis=0))
-        return np.concatenate(out)
+    def of_noise(directions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """[F, R, S] flipped means of the noise of S directions, [R, S] its means and mean squares."""
+        noise = np.einsum("sr,drn->dsn", root[directions], drawn, optimize=True)
+        straight = np.moveaxis(detrended(np.moveaxis(noise, 2, 0)), 0, 2)
+        means = np.tensordot(flips, straight, (1, 2)) / count
+        return tuple(a.astype(np.float32) for a in (means, straight.mean(axis=2), np.mean(straight**2, axis=2)))
 
-    def own_scores(k: int) -> tuple[np.ndarray, np.ndarray]:
-        of = np.r_[shown, k]
-        noise = np.einsum("sr,drn->dsn", root[of], drawn, optimize=True)
-        added = gram[of, k] / np.sqrt(count)
-        return noise, np.broadcast_to(added[None, :, None], (1, len(of), count))
+    def shares(means: np.ndarray, mean: np.ndarray, square: np.ndarray, added: np.ndarray) -> np.ndarray:
+        return (means + balance * added) ** 2 / np.maximum(square + 2 * added * mean + added**2, 1e-30)
 
-    return ScoreDraws(projected, shown, own_scores, p_values)
+    means, mean, square = of_noise(shown)
+    quiet = shares(means, mean, square, np.zeros_like(mean))
+
+    def tests(number: int, significance: float) -> Rejects:
+        k = len(unit) - asked + number
+        near = np.abs(gram[shown, k]) > BESIDE
+        others = quiet[:, :, ~near].max(axis=2, initial=0.0)
+        mine = of_noise(np.array([k]))
+        both = zip((means, mean, square), mine, strict=True)
+        flipped_means, own_mean, own_square = (np.concatenate([a[..., near], b], axis=-1) for a, b in both)
+        unit_added = (gram[np.r_[shown[near], k], k] / np.sqrt(count)).astype(np.float32)
+
+        def rejects(strength: np.ndarray) -> np.ndarray:
+            added = strength[:, None].astype(np.float32) * unit_added
+            largest = np.maximum(others, shares(flipped_means, own_mean, own_square, added).max(axis=2))
+            t = np.sqrt((count - 1) * largest[0] / np.maximum(1.0 - largest[0], 1e-30))
+            limit = flipped.isf(own.sf(t)) ** 2
+            return np.mean(largest >= limit / (count - 1 + limit) * (1 - 1e-12), axis=0) < significance
+
+        return rejects
+
+    return ScoreDraws(tests, config.draws)
 
 
 def _of_blocks(
     model: LinearModel,
     rows: Blocks,
     unit: np.ndarray,
-    projected: np.ndarray,
+    asked: int,
     shown: np.ndarray,
     rng: np.random.Generator,
     config: RehearsalConfig,
@@ -225,84 +266,91 @@ def _of_blocks(
         """[A, B, N] products of rows of two sets of vectors, block by block, as `Blocks.residuals` scales them."""
         return count * np.stack([vectors[:, i] @ other[:, i].T for i in inside], axis=2)
 
-    base_noise = np.swapaxes(of_rows(unit[shown], drawn), 0, 1)  # [R, S, N]
+    def standardised(directions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        """[F, A, S] flipped scores of S directions with A vectors."""
+        scale = 1.0 / np.sqrt(np.maximum(left[:, directions], 1e-30)) / count  # [F, S]
+        return np.tensordot(flips, of_rows(vectors, unit[directions]), (1, 2)) * scale[:, None]
 
-    def p_values(scores: np.ndarray, of: np.ndarray) -> np.ndarray:
-        scale = 1.0 / np.sqrt(np.maximum(left[:, of], 1e-30)) / count  # [F, S]
-        out = []
-        for part in np.array_split(scores, max(1, int(scores.size * len(flips) / count / CHUNK))):
-            largest = np.abs(np.einsum("fn,rsn->frs", flips, part, optimize=True) * scale[:, None]).max(axis=2)
-            out.append(np.mean(largest >= largest[0] * (1 - 1e-12), axis=0))
-        return np.concatenate(out)
+    noise = standardised(shown, drawn)
 
-    def own_scores(k: int) -> tuple[np.ndarray, np.ndarray]:
-        of = np.r_[shown, k]
-        noise = np.concatenate([base_noise, np.swapaxes(of_rows(unit[[k]], drawn), 0, 1)], axis=1)
-        return noise, of_rows(unit[of], unit[[k]])[:, 0][None]
+    def tests(number: int, significance: float) -> Rejects:
+        k = len(unit) - asked + number
+        added = standardised(shown, unit[[k]])
+        near = np.abs(added).max(axis=(0, 1)) > BESIDE
+        others = np.abs(noise[:, :, ~near]).max(axis=2, initial=0.0)
+        mine = np.array([k])
+        beside = np.concatenate([noise[:, :, near], standardised(mine, drawn)], axis=2)
+        grows = np.concatenate([added[:, :, near], standardised(mine, unit[[k]])], axis=2)
 
-    return ScoreDraws(projected, shown, own_scores, p_values)
+        def rejects(strength: np.ndarray) -> np.ndarray:
+            largest = np.maximum(others, np.abs(beside + strength[:, None] * grows).max(axis=2))
+            return np.mean(largest >= largest[0] * (1 - 1e-12), axis=0) < significance
+
+        return rejects
+
+    return ScoreDraws(tests, config.draws)
 
 
-@dataclass(frozen=True, eq=False)
-class GainDraws:
-    """What the validation test of the search makes of drawn noise.
+def gain_crossings(
+    model: LinearModel, number: int, added: np.ndarray, config: RehearsalConfig, selection: SelectionConfig
+) -> np.ndarray:
+    """[R] how much an effect must add to the validation part for the gain to be no chance and to take its share of U.
 
-    added: [K, M] what a unit of each coefficient adds to the validation part.  score: [R, N] drawn, deviation one.
+    added: [M] what it adds there, of any size.
     """
-
-    model: LinearModel
-    added: np.ndarray
-    config: RehearsalConfig
-
-    def crossings(self, k: int, selection: SelectionConfig) -> np.ndarray:
-        """[R] size of direction k from which the gain is no chance and takes its share of U."""
-        rows, rng = self.model.validation.rows, np.random.default_rng([self.config.seed, 2, k])
-        if isinstance(rows, Repeats):
-            return self._of_repeats(rows, k, selection, rng)
-        assert isinstance(rows, Blocks)
-        return self._of_blocks(rows, k, selection, rng)
-
-    def _of_repeats(self, rows: Repeats, k: int, selection: SelectionConfig, rng: np.random.Generator) -> np.ndarray:
-        """Gains a m.e + a^2 m.m / 2 of each repeat are above zero by Student's t of their detrended scatter."""
-        size, count = float(np.linalg.norm(self.added[k])), self.model.repeats
-        if size < 1e-12:
-            return np.full(self.config.draws, np.inf)
-        deviation = scatter(rows, self.added[[k]] / size, self.config.pooling)[0]
-        noise = deviation * rng.normal(size=(self.config.draws, count))
-        straight = detrended(noise.T).T
-        least = scipy.stats.t(max(count - 2, 1)).isf(selection.confirmation)
-        needed = 2 * (least * straight.std(axis=1, ddof=1) / count**0.5 - straight.mean(axis=1))
-        return np.maximum(needed, 0.0) / size
-
-    def _of_blocks(self, rows: Blocks, k: int, selection: SelectionConfig, rng: np.random.Generator) -> np.ndarray:
-        """The same by sign flips of blocks; and U, which holds the noise, must fall by its share."""
-        added, count = self.added[k], rows.units
-        squares = np.array([np.sum(added[rows.block == b] ** 2) for b in range(count)])
-        total = float(squares.sum())
-        if total < 1e-24:
-            return np.full(self.config.draws, np.inf)
-        level = self.model.validation.level * rows.counted.sum()
-        share = selection.least_gain
-        least = np.sqrt(share / (1 - share) * level / total)
-        drawn = self.model.validation.noise(self.config.draws, rng) * added
-        noise = np.stack([drawn[:, rows.block == b].sum(axis=1) for b in range(count)], axis=1)
-        flips = sign_flips(count, self.config.seed, one_sided=True)
-        flips = np.r_[flips[:1], rng.permutation(flips[1:])[: self.config.flips]]
-
-        def passes(size: np.ndarray) -> np.ndarray:
-            gains = 0.5 * size[:, None] ** 2 * squares + size[:, None] * noise
-            t = t_values(gains, flips)
-            return np.mean(t >= t[0] - 1e-12, axis=0) < selection.confirmation
-
-        low, high = np.full(len(noise), LEAST / total**0.5), np.full(len(noise), MOST / total**0.5)
-        ends = passes(high)
-        for _ in range(HALVINGS):
-            middle = np.sqrt(low * high)
-            yes = passes(middle)
-            low, high = np.where(yes, low, middle), np.where(yes, middle, high)
-        return np.maximum(np.where(ends, high, np.inf), least)
+    rows, rng = model.validation.rows, np.random.default_rng([config.seed, 2, number])
+    size = float(np.linalg.norm(added))
+    if size < 1e-12:
+        return np.full(config.draws, np.inf)
+    if isinstance(rows, Repeats):
+        return _repeats_gain(model, rows, added / size, config, selection, rng)
+    assert isinstance(rows, Blocks)
+    return _blocks_gain(model, rows, added / size, config, selection, rng)
 
 
-def gain_draws(model: LinearModel, config: RehearsalConfig) -> GainDraws:
-    """Noise of the validation test."""
-    return GainDraws(model, np.nan_to_num(model.unabsorbed()), config)
+def _repeats_gain(
+    model: LinearModel,
+    rows: Repeats,
+    unit: np.ndarray,
+    config: RehearsalConfig,
+    selection: SelectionConfig,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Gains a m.e + a^2 m.m / 2 of each repeat are above zero by Student's t of their detrended scatter."""
+    count = model.repeats
+    noise = scatter(rows, unit[None], config.pooling)[0] * rng.normal(size=(config.draws, count))
+    straight = detrended(noise.T).T
+    least = scipy.stats.t(max(count - 2, 1)).isf(selection.confirmation)
+    return np.maximum(2 * (least * straight.std(axis=1, ddof=1) / count**0.5 - straight.mean(axis=1)), 0.0)
+
+
+def _blocks_gain(
+    model: LinearModel,
+    rows: Blocks,
+    unit: np.ndarray,
+    config: RehearsalConfig,
+    selection: SelectionConfig,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """The same by sign flips of blocks; and U, which holds the noise, must fall by its share."""
+    count, share = rows.units, selection.least_gain
+    squares = np.array([np.sum(unit[rows.block == b] ** 2) for b in range(count)])
+    level = model.validation.level * rows.counted.sum()
+    least = np.sqrt(share / (1 - share) * level)
+    drawn = model.validation.noise(config.draws, rng) * unit
+    noise = np.stack([drawn[:, rows.block == b].sum(axis=1) for b in range(count)], axis=1)
+    flips = sign_flips(count, config.seed, one_sided=True)
+    flips = np.r_[flips[:1], rng.permutation(flips[1:])[: config.flips]]
+
+    def passes(size: np.ndarray) -> np.ndarray:
+        gains = 0.5 * size[:, None] ** 2 * squares + size[:, None] * noise
+        t = t_values(gains, flips)
+        return np.mean(t >= t[0] - 1e-12, axis=0) < selection.confirmation
+
+    low, high = np.full(len(noise), LEAST), np.full(len(noise), MOST)
+    ends = passes(high)
+    for _ in range(HALVINGS):
+        middle = np.sqrt(low * high)
+        yes = passes(middle)
+        low, high = np.where(yes, low, middle), np.where(yes, middle, high)
+    return np.maximum(np.where(ends, high, np.inf), least)

@@ -10,40 +10,60 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from droid_jax import runtime
 from droid_jax.cost.channels import SIMULATED
-from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, sensitivities
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.windowed_log import WindowedLog
+from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, refit, with_finer_step, with_step_difference
-from droid_jax.discrepancy.log_case import base_model, case_of
+from droid_jax.discrepancy.fitting import FittedModel, with_finer_step, with_step_difference
+from droid_jax.discrepancy.log_case import base_model, case_of, least_residual
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
+from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import RefineConfig, Refined
 from droid_jax.identify.search import NotReplayed
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import Scene, with_options
+from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
-from droid_jax.recordings.split import Split, roles_of, split_of
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
+from droid_jax.rehearsal.linear import (
+    LinearModel,
+    LinearPart,
+    RehearsalConfig,
+    distinguishable,
+    leftover_of,
+    rivals_of,
+    taken_by,
+)
 from droid_jax.rehearsal.plan import (
     ColumnNoise,
+    HiddenCase,
     RehearsalPlan,
     faster_motion,
+    hidden_form,
     noise_of_log,
     planned_recording,
+    robot_trace,
     simulated_channels,
 )
 from droid_jax.rehearsal.power import smallest_sizes
+from droid_jax.simulate.replay import Drive
 
-AT_REST = RefineConfig(iterations=0, basin_hops=0, spreads=1)  # slopes at the known parameters, and no step
+AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
+ROUGHLY = 5  # iterations of a base fit whose residual is taken for noise
+FINE = (8, 32)  # parts of a time step
 Tell = Callable[[str], None]
 
 
@@ -76,6 +96,7 @@ def rehearsed(
     tell: Tell = lambda stage: None,
     *,
     step_error: bool = True,
+    train_only: bool = False,
 ) -> Rehearsed:
     """The linear model of a search in these recordings.
 
@@ -88,7 +109,9 @@ def rehearsed(
         config: of the search.
         rehearsal: what is assumed.
         tell: called with each stage's name.
-        step_error: whether to measure what the time step leaves, which takes another compilation.
+        step_error: whether to measure what the time step leaves.
+        train_only: take the training part for the validation part too, and of each coefficient one shape; of recordings
+            with repeats.
 
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
@@ -100,50 +123,135 @@ def rehearsed(
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
     config = replace(config, channels=plan.channels or config.channels)
-    made, noise = _made(scene, whole, effects, recordings, at, plan, config, rehearsal)
+    clean = clean_channels(scene, space, whole, effects, at, plan, config)
+    made, noise = _made(clean, scene, recordings[:1] if train_only else recordings, plan, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
-    split = split_of(made)
+    halves = Split.RECORDINGS if len(recordings) > 1 else Split.REPEATS
+    split = halves if train_only else split_of(made)
     roles = roles_of(split, made)
     every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
     clock("case")
     needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
-    case = case_of(split, scene, space, effects, needed, replace(config, channels=every))
+    if train_only:
+        needed = {"train": roles["train"], "validation": roles["train"]}
+    refine = replace(config.refine, iterations=min(config.refine.iterations, ROUGHLY))  # of windows, which are fitted
+    case = case_of(split, scene, space, effects, needed, replace(config, channels=every, refine=refine))
     values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
     clock("base")
     if split is Split.BLOCKS:
         base = base_model(case)
-        values = base.values
+        values, slopes = base.values, base.refined.jacobian
     else:
-        base = refit(case.train, case.base, (), values[None], AT_REST)
+        base, slopes = known_base(case.train, case.base, values)
     clock("sensitivities")
     directions = directions_of(candidates(case.effects))
-    train = part_of(case.train, base, directions)
-    if split is Split.REPEATS:
-        validation = train
-    else:
-        beside_base = refit(case.validation, case.base, (), values[None], AT_REST)
-        validation = part_of(case.validation, beside_base, directions, base.refined.free)
-    if step_error and split is not Split.BLOCKS:
+    if train_only:
+        directions = tuple(directions[k] for k in one_shape_each(directions))
+    free = base.refined.free
+    train = part_of(case.train, base, slopes[:, free], directions)
+    validation = train
+    if split is not Split.REPEATS and not train_only:
+        beside_base, slopes = known_base(case.validation, case.base, values, spreads=0)
+        validation = part_of(case.validation, beside_base, slopes[:, free], directions)
+    if not train.rows.repeated:
+        share = unexplained_share(case, base, train, directions)
+        train, validation = train.quieter(share), validation.quieter(share)
+    elif step_error:
         clock("step error")
         with contextlib.suppress(NotReplayed):
-            fine = with_finer_step(case.train, case.base, roles["train"])
-            train = replace(train, step=with_step_difference(case.train, base, fine).step_difference)
+            train = replace(train, step=fine_steps(case.train, base, case.base, roles["train"]))
     clock("")
     model = linear_model(case, base, directions, train, validation)
     return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
 
 
-def _made(
+Clean = Callable[[Recording], Rollout]  # what a recording's commands make of the robot, without noise
+
+
+def clean_channels(
     scene: Scene,
+    space: Space,
     whole: Space,
     effects: Sequence[Effect],
-    recordings: Sequence[Recording],
     at: np.ndarray,
     plan: RehearsalPlan,
     config: DiscrepancyConfig,
-    rehearsal: RehearsalConfig,
+) -> Clean:
+    """The replay without noise at values `at` [D]: in plain C where only the noise of the repeats will count.
+
+    A mean of the repeats that is a little off changes nothing then: what is missing is looked for along slopes.
+    """
+
+    def simulated(recording: Recording) -> Rollout:
+        if (plan.repeats or recording.repeats) >= FEWEST_REPEATS:
+            with contextlib.suppress(ValueError):  # of what plain C does not have
+                return simulated_channels(scene, space, (), recording, at[whole.columns(space)], config, "mujoco")
+        return simulated_channels(ready(scene), whole, effects, recording, at, config)
+
+    return simulated
+
+
+def known_base(
+    residual_set: ResidualSet, base: Space, values: np.ndarray, spreads: int = 1
+) -> tuple[FittedModel, np.ndarray]:
+    """The base model at known values [D], with the slopes that a fit has; and [M, D] slopes along each axis.
+
+    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
+    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
+    may absorb of an effect is told by the steps along one axis.
+
+    spreads: see `LevenbergMarquardtConfig.spreads`.
+    """
+    whole, config = residual_set.cost.space, replace(AT_REST, spreads=spreads)
+
+    def residuals(rows: np.ndarray) -> np.ndarray:
+        return residual_set.whitened(whole.embed(base, rows, values))
+
+    problem = DampedProblem(residuals, base, config)
+    state, slopes = problem.start_with_slopes(problem.inside(base.to_search(values[None, whole.columns(base)])))
+    if not np.isfinite(state.objective[0]):
+        name = residual_set.comparison.name
+        raise NotReplayed(f"the simulation of {name!r} blows up at the parameters' values: begin at other ones")
+    x = state.x[0]
+    refined = Refined(
+        base, x, base.from_search(x), float(state.objective[0]), state.residual[0],
+        problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
+    )  # fmt: skip
+    rows = residual_set.resampling
+    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    at = whole.embed(base, refined.best[None], values)[0]
+    return FittedModel((), at, base, refined, left, rows.discrepancy(left)), slopes[0]
+
+
+def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recording: Recording) -> np.ndarray | None:
+    """[M] what far finer time steps change of the base model, in one repeat's noise; None in inverse mode.
+
+    In plain C, where nothing is compiled.  Its error is of first order in the step: of two steps' it is extrapolated
+    to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.
+    """
+    known = residual_set.cost
+    if not isinstance(known.drives[0], Drive) or isinstance(known, WindowedLog):
+        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
+    config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
+    try:
+        coarse, fine = (
+            make_cost(
+                with_options(known.scene, timestep=timestep / parts), base, [recording], engine="mujoco", config=config,
+                check=False,
+            )
+            for parts in FINE
+        )  # fmt: skip
+    except ValueError:
+        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
+    near, nearer = (with_step_difference(residual_set, model, cost).step_difference for cost in (coarse, fine))
+    assert near is not None and nearer is not None
+    return nearer + (nearer - near) / (FINE[1] / FINE[0] - 1)
+
+
+def _made(
+    clean: Clean, scene: Scene, recordings: Sequence[Recording], plan: RehearsalPlan, rehearsal: RehearsalConfig
 ) -> tuple[list[Recording], list[ColumnNoise]]:
-    """The recordings to rehearse, and the noise of the first one's columns; at: [D] where parameters stand.
+    """The recordings to rehearse, and the noise of the first one's columns.
 
     Logs that are cut in time stay as they are: their noise is what fits leave of them.
     """
@@ -155,8 +263,7 @@ def _made(
     made = list[Recording]()
     noise = list[ColumnNoise]()
     for i, recording in enumerate(recordings):
-        rollout = simulated_channels(ready(scene), whole, effects, recording, at, config)
-        full, each = planned_recording(scene, recording, rollout, plan, rehearsal, rehearsal.seed + i)
+        full, each = planned_recording(scene, recording, clean(recording), plan, rehearsal, rehearsal.seed + i)
         made.append(full)
         noise = noise or each
     return made, noise
@@ -182,19 +289,34 @@ def _alike(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 
 def part_of(
-    residual_set: ResidualSet, base: FittedModel, directions: Sequence[ScoreDirection], free: np.ndarray | None = None
+    residual_set: ResidualSet, base: FittedModel, slopes: np.ndarray, directions: Sequence[ScoreDirection]
 ) -> LinearPart:
-    """A part of the recordings in the linear model, at the values of `base`."""
-    free = base.refined.free if free is None else free
-    root = residual_set.repeats**0.5
+    """A part of the recordings in the linear model, at the values of `base`; slopes: [M, D] of its residual."""
     names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
     channel = np.array(names)[residual_set.column]
     raw = sensitivities(residual_set, base.values, directions)
-    rows, slopes = residual_set.resampling, base.refined.jacobian[:, free] / root
+    rows, slopes = residual_set.resampling, slopes / residual_set.repeats**0.5
     if rows.repeated:
         return LinearPart(raw, slopes, rows, channel)
     left = base.residuals.mean(axis=0)
     return LinearPart(raw, slopes, rows, channel, base.discrepancy, residual=left, column=residual_set.column)
+
+
+def unexplained_share(case: Case, base: FittedModel, train: LinearPart, directions: Sequence[ScoreDirection]) -> float:
+    """How much of a log's residual stays where the best candidates have taken theirs, of its root mean square.
+
+    What the base model leaves of a real log holds the very effects that are looked for.  Taken whole for noise, it hid
+    a servo's friction that the search then named.
+    """
+    raw, held = np.nan_to_num(train.raw), base.refined.prior[base.refined.free] * case.train.prior_slack
+    projected = project(raw, train.base, held)
+    rows = case.train.resampling
+    found = scored(
+        base.residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, train.base, held)
+    )
+    left = base.residuals.mean(axis=0)
+    least = least_residual(found, left, case.full_space, case.config)
+    return float(np.linalg.norm(least) / max(np.linalg.norm(left), 1e-30))
 
 
 def linear_model(
@@ -205,25 +327,33 @@ def linear_model(
     validation: LinearPart,
 ) -> LinearModel:
     """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
-    space, minimum = case.full_space, case.minimum_sizes
+    space, minimum, refined = case.full_space, case.minimum_sizes, base.refined
+    room = [base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high)]
     of = [space[d.coefficient] for d in directions]
     return LinearModel(
         directions=tuple(directions),
         train=replace(train, raw=np.nan_to_num(train.raw)),
         validation=replace(validation, raw=np.nan_to_num(validation.raw)),
-        prior=base.refined.prior[base.refined.free],
+        prior=refined.prior[refined.free],
         slack=case.train.prior_slack,
         repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
         minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
         low=np.array([p.low - p.mean for p in of]),
         high=np.array([p.high - p.mean for p in of]),
+        base_low=room[0][refined.free],
+        base_high=room[1][refined.free],
     )
 
 
 def hidden_directions(model: LinearModel) -> list[int]:
+    """Of each coefficient at each place one direction (`one_shape_each`)."""
+    return one_shape_each(model.directions)
+
+
+def one_shape_each(directions: Sequence[ScoreDirection]) -> list[int]:
     """Of each coefficient at each place one direction: in the middle of the shapes that are tried."""
     groups: dict[str, list[int]] = {}
-    for k, direction in enumerate(model.directions):
+    for k, direction in enumerate(directions):
         groups.setdefault(direction.coefficient, []).append(k)
     return [rows[len(rows) // 2] for rows in groups.values()]
 
@@ -277,6 +407,109 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
     return out
 
 
+def robot_whitened(
+    found: Rehearsed, space: Space, recording: Recording, cases: Sequence[HiddenCase], config: DiscrepancyConfig
+) -> list[np.ndarray | None]:
+    """[M] of each case what the synthetic robot measures of the training motion, in one repeat's noise.
+
+    None where its simulation blows up.  MuJoCo's steps leave Python to the other threads.
+    """
+    comparison, scene = found.case.train.comparison, found.case.train.cost.scene
+    known = found.base.values[found.case.full_space.columns(space)]
+    clock = comparison.clock - comparison.clock[0]
+
+    def simulated(case: HiddenCase) -> Rollout | None:
+        try:
+            return robot_trace(scene, space, recording, known, case, config, 0)
+        except ValueError:
+            return None
+
+    def whitened(trace: Rollout) -> np.ndarray:
+        fields = {n: interpolate(clock, trace.time, getattr(trace, n)) for n in ("torque", "position", "velocity")}
+        angle = np.interp(clock, trace.time, trace.object_angle)
+        on_clock = replace(trace, time=clock, object_angle=angle, contact=np.zeros((len(clock), 0), bool), **fields)
+        return np.asarray(comparison.whitened(on_clock), float) / comparison.repeats**0.5
+
+    with ThreadPoolExecutor(runtime.cores()) as pool:
+        traces = list(pool.map(simulated, cases))
+    return [None if trace is None else whitened(trace) for trace in traces]
+
+
+def law_checks(
+    found: Rehearsed,
+    space: Space,
+    known: Sequence[Mapping[str, Any]],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
+) -> list[dict[str, Any] | None]:
+    """Of each answer whether an effect of that size would be known for what it is; None where none is found.
+
+    The linear model takes effects to be small and the robot's law to be the library's.  Here each is simulated at the
+    size that was found.  One whose law has a shape is simulated at its best place once more with the law of the
+    synthetic robot, which has another.  Of the two the worse counts: `own` is the share of what the base parameters
+    leave of it that the library's effect takes, `other` a candidate that takes clearly more.
+    """
+    out: list[dict[str, Any] | None] = [None] * len(known)
+    sizes = [e["smallest"] for e in known]
+    asked = [i for i, size in enumerate(sizes) if np.isfinite(size)]
+    if not found.model.repeated or not asked:
+        return out
+    train, wanted, model = found.case.train, hidden_directions(found.model), found.model.of(found.compared)
+    seen = np.isin(found.model.train.channel, found.compared)
+
+    def check(i: int, difference: np.ndarray, law: str) -> None:
+        if not np.isfinite(difference).all():
+            return
+        left = leftover_of(model, difference[seen], np.zeros(len(model.validation.base)), 1.0)
+        taken = taken_by(model, left.at(1.0)[0], left.free[-1])
+        own = max(v for key, v in taken.items() if (key.effect, key.location) == _place(known[i]))
+        rival = max(taken, key=taken.__getitem__)
+        apart = known[i]["noncentrality"] ** 2 * (taken[rival] - own)
+        confused = apart > distinguishable(model, config, rehearsal.share)
+        confused &= 1 - own > config.selection.equivalence_factor * (1 - taken[rival])
+        other = {"effect": rival.effect, "location": rival.location, "share": taken[rival]} if confused else None
+        before, sure = out[i], bool(own >= rehearsal.known and not confused)
+        if before is None or (own < before["own"] and not (before["sure"] is False and sure)):
+            out[i] = {"law": law, "own": own, "other": other, "sure": sure}
+
+    far = [sizes[i] * float(found.model.sign[wanted[i]]) for i in asked]
+    slopes = sensitivities(train, found.base.values, [found.model.directions[wanted[i]] for i in asked], far)
+    for i, slope, size in zip(asked, slopes, far, strict=True):
+        check(i, slope * size, "the library's")
+    for i, difference in _other_laws(found, space, known, config):
+        check(i, difference, "the synthetic robot's")
+    return out
+
+
+def _other_laws(
+    found: Rehearsed, space: Space, known: Sequence[Mapping[str, Any]], config: DiscrepancyConfig
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Of each effect with a shape, at its best place, what the synthetic robot's law adds to the training part, [M]."""
+    recording, scene = found.roles["train"], found.case.train.cost.scene
+    if not recording.command.size:
+        return
+    best = [entry for entry, _ in _one_each(known, range(len(known)))]
+    asked, cases = list[int](), [HiddenCase(0)]
+    shaped = {effect.name for effect in found.case.effects if effect.shape_parameters}
+    for i, entry in enumerate(known):
+        if entry["effect"] not in shaped:
+            continue
+        name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
+        if name and np.isfinite(entry["smallest"]) and any(entry is one for one in best):
+            asked.append(i)
+            cases.append(HiddenCase(0, hidden=name, joint=joint, amplitude=entry["smallest"]))
+    if not asked:
+        return
+    plain, *others = robot_whitened(found, space, recording, cases, config)
+    for i, other in zip(asked, others, strict=True):
+        if plain is not None and other is not None:
+            yield i, other - plain
+
+
+def _place(entry: Mapping[str, Any]) -> tuple[str, str]:
+    return entry["effect"], entry["location"]
+
+
 def improvements(
     found: Rehearsed,
     known: Sequence[Mapping[str, Any]],
@@ -290,14 +523,8 @@ def improvements(
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
     out = []
-    for what, other, more, source in _variants(found, faster):
-        if source is found and not other.repeated and more > 1:
-            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
-            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
-            now = _recovered(found, other, rehearsal, more)
-        else:
-            sizes = smallest_sizes(other, wanted, rehearsal, config.selection)
-            after, now = np.array([s.size for s in sizes]), _recovered(source, other, rehearsal)
+
+    def helped(what: str, before: np.ndarray, after: np.ndarray, now: int) -> None:
         both = np.isfinite(before) & np.isfinite(after)
         ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
         out.append(
@@ -309,6 +536,21 @@ def improvements(
                 "recovered_more": now - recovered,
             }
         )
+
+    def sizes(of: LinearModel, rows: Sequence[int]) -> np.ndarray:
+        return np.array([s.size for s in smallest_sizes(of, rows, rehearsal, config.selection)])
+
+    for what, other, more in _variants(found):
+        if not other.repeated and more > 1:
+            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
+            after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
+        else:
+            after = sizes(other, wanted)
+        helped(what, before, after, _recovered(found, other, rehearsal, more))
+    if faster is not None:  # of the training motion alone, as this one
+        moved, here = faster.model.of(found.compared), model.alone(every)
+        rows = [every.index(k) for k in wanted]
+        helped("the faster motion", sizes(here, rows), sizes(moved, rows), _recovered(faster, moved, rehearsal))
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
 
 
@@ -322,19 +564,17 @@ def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list
     return list(best.values())
 
 
-def _variants(found: Rehearsed, faster: Rehearsed | None) -> Iterator[tuple[str, LinearModel, float, Rehearsed]]:
+def _variants(found: Rehearsed) -> Iterator[tuple[str, LinearModel, float]]:
+    """What could be changed of the same motion, its linear model, and how many times as long a log is."""
     model = found.model.of(found.compared)
     for factor in (2, 4):
         if model.repeated:
-            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0, found
+            yield f"{factor} times as many repeats", replace(model, repeats=factor * model.repeats), 1.0
         else:
-            yield f"a log {factor} times as long", model, float(factor), found
+            yield f"a log {factor} times as long", model, float(factor)
     for name in dict.fromkeys(found.model.train.channel.tolist()):
         if name not in found.compared:
-            what = name.replace("_", " ")
-            yield f"{what} compared too", found.model.of((*found.compared, name)), 1.0, found
-    if faster is not None:
-        yield "the faster motion", faster.model.of(found.compared), 1.0, faster
+            yield f"{name.replace('_', ' ')} compared too", found.model.of((*found.compared, name)), 1.0
 
 
 def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
@@ -369,7 +609,7 @@ def quick_rehearsal(
         rehearsal: what counts as found.
         tell: called with each stage's name.
         faster: whether a faster motion is looked at too.
-        step_error: whether to measure what the time step leaves, which takes another compilation.
+        step_error: whether to measure what the time step leaves.
 
     Returns:
         The linear model of the search, and its answers as plain data (rehearsal.json).
@@ -377,21 +617,27 @@ def quick_rehearsal(
     Raises:
         ValueError: what the search refuses too, or a simulation that blows up.
     """
-    began = time.monotonic()
+    began, used = time.monotonic(), time.process_time()
     plan, config = plan or RehearsalPlan(), config or DiscrepancyConfig()
     rehearsal = rehearsal or RehearsalConfig()
     found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
     tell("tests")
     known = answers(found, config, rehearsal)
+    tell("laws")
+    checks = law_checks(found, space, known, config, rehearsal)
+    known = [{**entry, "law": check} for entry, check in zip(known, checks, strict=True)]
     model = found.model.of(found.compared)
     other = None
     if faster and found.model.repeated and all(r.command.size for r in recordings):
+        tell("a faster motion")
         moved = [faster_motion(r, rehearsal.faster) for r in recordings]
         other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
         try:
             with warnings.catch_warnings():  # what there is to warn of was said of the motion itself
                 warnings.simplefilter("ignore", UserWarning)
-                other = rehearsed(scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False)
+                other = rehearsed(
+                    scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False, train_only=True
+                )
         except ValueError as error:
             warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
     tell("improvements")
@@ -438,7 +684,7 @@ def quick_rehearsal(
         ],
         "effects": known,
         "helps": helps,
-        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began},
+        "seconds": {**dict(found.seconds), "whole": time.monotonic() - began, "cpu": time.process_time() - used},
     }
     return found, answer
 

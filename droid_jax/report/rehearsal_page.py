@@ -13,6 +13,9 @@ from droid_jax.report.text import counted, html, label, listed, percent, quantit
 
 Result = Mapping[str, Any]
 MOST_RIVALS = 3
+MOST, MOST_PAIRS, MOST_NAMES = 6, 3, 3  # things that a sentence lists
+KNOWN = ("N m", "N", "kg", "m", "rad", "s")  # units of sizes that people have a feeling for
+NEAR = 2.0  # times the minimum effect size
 HELPS = 1.1  # times smaller, from which a change is worth a sentence
 
 
@@ -22,6 +25,7 @@ def rehearsal_page(result: Result) -> str:
     return html(
         "rehearsal.html.jinja",
         result=result,
+        recordings=motions_of(result),
         sentences=rehearsal_sentences(result),
         parameters=parameter_rows(result),
         effects=effect_rows(result),
@@ -33,6 +37,14 @@ def rehearsal_page(result: Result) -> str:
     )
 
 
+def motions_of(result: Result) -> str:
+    """Their names, of many the first ones and how many there are."""
+    names = list(result["recordings"])
+    return (
+        listed(names) if len(names) <= MOST_NAMES else f"{counted(len(names), 'recording')}, {names[0]} to {names[-1]}"
+    )
+
+
 def best_of(result: Result) -> list[dict[str, Any]]:
     """Of each effect at each place the coefficient that is found at the smallest multiple of its minimum size."""
     best: dict[tuple[str, str], dict[str, Any]] = {}
@@ -40,7 +52,7 @@ def best_of(result: Result) -> list[dict[str, Any]]:
         key = (entry["effect"], entry["location"])
         if key not in best or _multiple(entry) < _multiple(best[key]):
             best[key] = entry
-    return sorted(best.values(), key=lambda e: (_multiple(e), e["effect"], e["location"]))
+    return sorted(best.values(), key=lambda e: (e["location"], _multiple(e), e["effect"]))
 
 
 def _multiple(entry: Mapping[str, Any]) -> float:
@@ -51,16 +63,22 @@ def _multiple(entry: Mapping[str, Any]) -> float:
 
 
 def effect_rows(result: Result) -> list[tuple[str, ...]]:
-    """Effect, place, smallest size, what decides it, what it is taken for."""
+    """Effect, place, smallest size, what decides it, what it is taken for; place by place."""
     rows = []
     for e in best_of(result):
         size = "not found" if e["smallest"] is None else quantity(e["smallest"], e["unit"], 2)
+        size = size if _sure(e) else f"{size}, doubtful"
         rows.append((label(e["effect"]), label(e["location"]), size, e["limit"], _rivals(e)))
     return rows
 
 
 def _rivals(entry: Mapping[str, Any]) -> str:
     said = []
+    law = entry.get("law") or {}
+    if law.get("other"):
+        other = law["other"]
+        why = "beyond small sizes" if law["law"] == "the library's" else "with another law"
+        said.append(f"{_thing(other)} ({why})")
     for rival in entry["taken_for"][:MOST_RIVALS]:
         name = f"{label(rival['effect']).lower()} at {label(rival['location']).lower()}"
         below = rival["below"]
@@ -116,40 +134,90 @@ def full_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def rehearsal_sentences(result: Result) -> list[str]:
-    """What a person can act on."""
+    """What a person can act on, the most important first."""
     best = best_of(result)
-    found = [e for e in best if e["smallest"] is not None]
+    found = [e for e in best if e["smallest"] is not None and _sure(e)]
+    doubtful = [e for e in best if e["smallest"] is not None and not _sure(e)]
     lost = [e for e in best if e["smallest"] is None]
     out = []
     if found:
-        said = [f"{_thing(e)} of {quantity(e['smallest'], e['unit'], 2)}" for e in found[:3]]
-        out.append(f"With this motion {listed(said)} would be found.")
-        worst = found[-1]
-        if len(found) > 3:
-            thing = _thing(worst)
-            size = quantity(worst["smallest"], worst["unit"], 2)
-            out.append(f"{thing[:1].upper()}{thing[1:]} below {size} would not.")
+        ranked = sorted([e for e in found if e["unit"] in KNOWN] or found, key=_multiple)
+        first, last = next((e for e in ranked if e["unit"] == "N m"), ranked[0]), ranked[-1]
+        sentence = (
+            f"With this motion {_thing(first)} would be found from {quantity(first['smallest'], first['unit'], 2)}"
+        )
+        if last is not first:
+            sentence += f", {_thing(last)} only from {quantity(last['smallest'], last['unit'], 2)}"
+        out.append(f"{sentence}.")
+    else:
+        out.append("With this motion no effect would surely be found.")
+    out += _help(result)
+    near = [e for e in found if _multiple(e) <= NEAR]
+    out.append(
+        f"Of {counted(len(best), 'effect')}, counted at each place, {len(near)} would be found below {NEAR:g} times "
+        f"the minimum effect size, {len(found) - len(near)} only when larger, {len(lost)} at no size within bounds"
+        + (f"; {len(doubtful)} doubtful." if doubtful else ".")
+    )
+    if doubtful:
+        out.append(f"Something would be seen, but probably not named for what it is: {_doubts(doubtful)}.")
     if lost:
-        names = listed(list(dict.fromkeys(_thing(e) for e in lost))[:6])
-        out.append(f"At no size within its bounds: {names}.")
-    sure = [e for e in found if any(r["below"] is None for r in e["taken_for"])]
-    if sure:
-        e = sure[0]
-        rival = _thing(next(r for r in e["taken_for"] if r["below"] is None))
-        out.append(f"In this motion {_thing(e)} acts as {rival} does: the search will name both.")
+        out.append(f"At no size: {_by_effect(lost, best)}.")
+    if alike := _alike(found):
+        out.append(f"In this motion these act alike, and the search will name both: {alike}.")
     main = [p for p in result["parameters"] if not p["nuisance"]]
     missed = [label(p["name"]).lower() for p in main if not p["recovered"]]
     out.append(
         f"{counted(len(main) - len(missed), 'parameter')} of {len(main)} would be recovered"
-        + (f"; not {listed(missed[:6])}{' and others' if len(missed) > 6 else ''}." if missed else ".")
+        + (f"; not {listed(missed[:MOST])}{' and others' if len(missed) > MOST else ''}." if missed else ".")
     )
-    if result["helps"]:
-        h = result["helps"][0]
-        if h["times_smaller"] > HELPS or h["newly_found"] > h["lost"] or h["recovered_more"] > 0:
-            out.append(f"What would help most: {h['what']} (sizes {h['times_smaller']:.1f} times smaller).")
-        else:
-            out.append("More repeats, other channels or a faster motion would help little.")
     return out
+
+
+def _help(result: Result) -> list[str]:
+    """What would help most."""
+    if not result["helps"]:
+        return []
+    h = result["helps"][0]
+    if not (h["times_smaller"] > HELPS or h["newly_found"] > h["lost"] or h["recovered_more"] > 0):
+        return ["More repeats, other channels or a faster motion would help little."]
+    more = [f"sizes {h['times_smaller']:.1f} times smaller"] if h["times_smaller"] > HELPS else []
+    if h["newly_found"] > h["lost"]:
+        more.append(f"{counted(h['newly_found'] - h['lost'], 'more effect')} found")
+    if h["recovered_more"] > 0:
+        more.append(f"{counted(h['recovered_more'], 'more parameter')} recovered")
+    return [f"What would help most: {h['what']} ({', '.join(more)})."]
+
+
+def _sure(entry: Mapping[str, Any]) -> bool:
+    return bool((entry.get("law") or {"sure": True})["sure"])
+
+
+def _doubts(entries: list[dict[str, Any]]) -> str:
+    said = []
+    for e in entries[:MOST]:
+        other = (e.get("law") or {}).get("other")
+        said.append(_thing(e) + (f" (more like {_thing(other)})" if other else ""))
+    return listed(said) + (" and others" if len(entries) > MOST else "")
+
+
+def _by_effect(entries: list[dict[str, Any]], every: list[dict[str, Any]]) -> str:
+    """ "encoder offset at 2 of 7 places, opening check at door"."""
+    said = []
+    for effect in dict.fromkeys(e["effect"] for e in entries):
+        mine, of = ([e for e in some if e["effect"] == effect] for some in (entries, every))
+        several = f"{label(effect).lower()} at {len(mine)} of {len(of)} places"
+        said.append(several if len(of) > 1 else _thing(mine[0]))
+    return listed(said[:MOST]) + (" and others" if len(said) > MOST else "")
+
+
+def _alike(found: list[dict[str, Any]]) -> str:
+    pairs = dict[frozenset[str], str]()
+    for e in found:
+        for rival in e["taken_for"]:
+            if rival["below"] is None:
+                both = frozenset((_thing(e), _thing(rival)))
+                pairs.setdefault(both, f"{_thing(e)} as {_thing(rival)}")
+    return "; ".join(list(pairs.values())[:MOST_PAIRS]) + (" and others" if len(pairs) > MOST_PAIRS else "")
 
 
 def how_sentences(result: Result) -> list[str]:
@@ -162,7 +230,10 @@ def how_sentences(result: Result) -> list[str]:
         f"Found means in {share:.0%} of {how['rehearsal']['draws']} drawn noises: the score test over "
         f"{how['directions']} coefficients has p < {how['significance']:g}, and the validation test p < "
         f"{how['confirmation']:g}.",
-        "The residual is taken to be linear in parameters and effects, and the robot's law to be the library's.",
+        "The residual is taken to be linear in parameters and effects.",
+        "Then each effect was simulated at the size that is found; one whose law has a shape also with the law of the "
+        "synthetic robot. Doubtful: the library's effect takes less than "
+        f"{percent(how['rehearsal'].get('known', 0.5))} of that, or another one takes clearly more.",
         f"Recovered means that less than {percent(how['recovered_below'])} of the prior's width is left.",
     ]
     if not result.get("full"):

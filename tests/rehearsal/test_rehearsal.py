@@ -13,17 +13,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
-from benchmarks.rehearse import next_step
+from benchmarks.rehearse import measured_size, next_step, summary
+from droid_jax.commands.rehearse import plain
 from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
+from droid_jax.discrepancy.fitting import with_finer_step, with_step_difference
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p
+from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.candidate import Candidate
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import joint_damping
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
@@ -36,10 +40,11 @@ from droid_jax.rehearsal.full import (
     scores,
     synthetic_log,
 )
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, rivals_of
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, leftover, rivals_of
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import smallest_sizes
-from droid_jax.rehearsal.quick import quick_rehearsal, rehearsed
+from droid_jax.rehearsal.quick import fine_steps, quick_rehearsal, rehearsed
+from droid_jax.report.rehearsal_page import rehearsal_sentences
 from droid_jax.run import main
 
 REPEATS, LENGTH, DIRECTIONS, BASE = 10, 160, 12, 4
@@ -47,7 +52,7 @@ CONFIG, CASES = RehearsalConfig(draws=64, margin=1.0), 60  # the linear model is
 WIDE = np.full(BASE, 10.0)
 HINGE = Path(__file__).resolve().parents[2] / "experiments" / "hinge.xml"
 JOINTS, SECONDS, REACH = ("door",), 3.0, 0.25
-EFFECTS = ("hinge_preload", "drag", "opening_check")
+EFFECTS = ("hinge_preload", "drag", "opening_check", "over_centre_spring")
 PARAMETERS = [
     {"field": "dof_damping", "element": "door", "unit": "N m s/rad", "std": 0.3, "high": 10.0},
     {"field": "body_mass", "element": "panel", "std": 0.1, "high": 5.0},
@@ -160,6 +165,26 @@ def test_what_the_base_parameters_absorb_is_not_found():
     assert gone.size > 100 * kept.size
 
 
+def test_a_parameter_absorbs_an_effect_only_as_far_as_its_bounds():
+    """The oracle is a bounded least-squares fit of base parameters and priors to the effect."""
+    model = of_repeats(base_low=np.full(BASE, -3.0), base_high=np.full(BASE, 3.0))
+    raw = model.train.raw.copy()
+    raw[0] = 10.0 * model.train.base[:, 0] + 0.3 * raw[0]
+    part = LinearPart(raw, model.train.base, model.train.rows, model.train.channel)
+    near = of_repeats(train=part, validation=part, base_low=np.full(BASE, -3.0), base_high=np.full(BASE, 3.0))
+    of, held = leftover(near, 0), near.held(1.0)
+    assert len(of.begins) > 1
+    for size in (0.1, 0.5, 2.0):
+        columns, target = np.vstack([part.base, np.diag(1 / held)]), np.r_[size * raw[0], np.zeros(BASE)]
+        fit = lsq_linear(columns, target, bounds=(-3.0, 3.0)).x
+        left = size * raw[0] - part.base @ fit
+        assert np.linalg.norm(of.at(size)[1] - left) < 1e-3 * np.linalg.norm(left)
+        assert of.size_of(np.array([np.linalg.norm(left)]), validation=True)[0] == pytest.approx(size, rel=0.02)
+    unbounded = of_repeats(train=part, validation=part)
+    (loose,), (tight,) = (smallest_sizes(m, [0], CONFIG) for m in (unbounded, near))
+    assert tight.size < 0.8 * loose.size
+
+
 def test_rivals_are_the_candidates_that_act_alike():
     """Of two directions with a cosine of 0.99 each is taken for the other, up to a size; of others, none at it."""
     model = of_repeats()
@@ -180,9 +205,9 @@ def test_rivals_are_the_candidates_that_act_alike():
     ]
 
 
-def motion(name: str = "train", period: float = 1.5) -> Recording:
+def motion(name: str = "train", period: float = 1.5, seconds: float = SECONDS) -> Recording:
     """Commands that open the door by REACH and close it; the measured positions are the commands."""
-    time = np.arange(0.0, SECONDS, 0.004)
+    time = np.arange(0.0, seconds, 0.004)
     angle = 0.5 * REACH * (1 - np.cos(2 * np.pi * time / period))[:, None]
     position = Channel("position", "rad", JOINTS, time, angle[None], np.ones((1, *angle.shape), bool))
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
@@ -198,8 +223,8 @@ def hinge() -> tuple[Scene, Space]:
 @pytest.fixture(scope="module")
 def result(hinge) -> dict[str, Any]:
     scene, space = hinge
-    recordings = [motion(), motion("validation", 1.0)]
-    return quick_rehearsal(scene, space, library(scene, EFFECTS), recordings, PLAN, faster=False, step_error=False)[1]
+    recordings = [motion(), motion("validation", 1.0, 2.5)]
+    return quick_rehearsal(scene, space, library(scene, EFFECTS), recordings, PLAN, step_error=False)[1]
 
 
 def entry(result: dict[str, Any], effect: str) -> dict[str, Any]:
@@ -214,6 +239,41 @@ def test_what_has_signal_is_found_and_what_has_none_is_not(result):
     assert damping["recovered"] and damping["shrinkage"] < 0.25
 
 
+def test_an_effect_whose_other_law_looks_like_another_effect_is_doubtful(result):
+    """The synthetic robot's over-centre spring pulls hardest at the closed door, as a preload does."""
+    spring, preload = entry(result, "over_centre_spring")["law"], entry(result, "hinge_preload")["law"]
+    assert not spring["sure"] and spring["law"] == "the synthetic robot's"
+    assert preload["sure"] and preload["own"] > 0.9
+    assert any("over centre spring" in s and "not named" in s for s in rehearsal_sentences(plain(result)))
+
+
+def test_slopes_of_one_batch_are_those_of_two():
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(7, 2))
+    space = Space(tuple(Parameter(n, "-", 0.0, 1.0, -0.5, 9.0) for n in "ab"))
+    problem = DampedProblem(lambda rows: rows @ matrix.T + 1.0, space, LevenbergMarquardtConfig())
+    x = np.array([[-0.5, 1.0]])
+    (one, slopes), two = problem.start_with_slopes(x), problem.start(x)
+    np.testing.assert_allclose(slopes, problem.jacobian(two))
+    np.testing.assert_allclose(slopes[0], matrix)
+    np.testing.assert_allclose(one.residual, two.residual)
+    assert one.objective == pytest.approx(two.objective)
+
+
+def test_plain_c_in_fine_steps_tells_the_step_error(hinge):
+    """The same order as the search's own, of the compiled replay at a quarter of its step."""
+    scene, space = hinge
+    recordings = [motion(), motion("validation", 1.0)]
+    asked = (scene, space, library(scene, EFFECTS), recordings, PLAN, DiscrepancyConfig(), CONFIG)
+    of = rehearsed(*asked, step_error=False)
+    train, roles = of.case.train, of.roles
+    known = fine_steps(train, of.base, of.case.base, roles["train"])
+    own = with_step_difference(train, of.base, with_finer_step(train, of.case.base, roles["train"])).step_difference
+    assert known is not None and own is not None
+    assert known @ own > 0.9 * np.linalg.norm(known) * np.linalg.norm(own)
+    assert 0.9 < np.linalg.norm(known) / np.linalg.norm(own) < 1.6  # a quarter of the step has an error too
+
+
 def test_noise_and_thresholds_are_stated(result):
     how = result["how"]
     assert how["repeats"] == 10 and how["simulated"] and how["compared"] == ["torque"]
@@ -225,7 +285,9 @@ def test_noise_and_thresholds_are_stated(result):
 
 def test_more_repeats_help_and_are_compared_with_other_channels(result):
     helps = {h["what"]: h for h in result["helps"]}
-    assert {"2 times as many repeats", "4 times as many repeats", "position compared too"} <= set(helps)
+    assert {"2 times as many repeats", "4 times as many repeats", "position compared too", "the faster motion"} <= set(
+        helps
+    )
     assert helps["4 times as many repeats"]["times_smaller"] >= helps["2 times as many repeats"]["times_smaller"] > 1.1
 
 
@@ -251,6 +313,35 @@ def test_hidden_forms_are_those_of_the_synthetic_robot(hinge):
     assert hidden_form(scene, "hinge_stribeck", "door", "N m") == ("stribeck_friction", "door")
     assert hidden_form(scene, "mine", "door", "N m") == ("", "")
     assert hidden_form(scene, "tilted_frame", "door", "N m") == ("", "")  # of another unit
+
+
+@pytest.mark.parametrize(
+    ("found", "measured"),
+    [
+        ({1.0: True, 0.7: False}, 1.0),
+        ({1.0: False, 1.4: True}, 1.4),
+        ({1.0: True}, None),
+        ({0.5: True, 0.7: True}, 0.5),
+        ({1.0: False, 2.0: False}, np.inf),
+        ({1.0: False}, None),
+        ({0.9: True, 1.2: False, 1.5: True}, 1.5),
+    ],
+)
+def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[float, bool], measured: float | None):
+    cases = [{"size": 3.0 * t, "found": f} for t, f in found.items()]
+    assert measured_size({"smallest": 3.0}, cases) == measured
+
+
+def test_advice_is_wrong_where_what_would_be_found_was_not():
+    usual = {"within": True, "not_found_at_twice": False, "missed": False, "found": {"1": [1, 1]}}
+    of = [
+        {**usual, "sure": True, "measured_over_predicted": 0.7},
+        {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
+        {**usual, "sure": False, "missed": True, "not_found_at_twice": True, "within": False},
+    ]
+    told = summary({"hinge": of})
+    assert told["wrong_advice_rate"] == 0.5 and told["advised"] == 2 and told["within_factor"] == pytest.approx(2 / 3)
+    assert told["within_factor_of_sure"] == 1.0 and told["unsure_not_found"] == 1
 
 
 def test_one_case_of_five_has_nothing_hidden_and_sizes_stay_inside_bounds(hinge):
