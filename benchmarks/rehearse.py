@@ -43,8 +43,9 @@ from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
 from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
+from droid_jax.rehearsal.linearised import rehearsed  # noqa: E402
 from droid_jax.rehearsal.plan import RehearsalPlan  # noqa: E402
-from droid_jax.rehearsal.quick import quick_rehearsal, rehearsed  # noqa: E402
+from droid_jax.rehearsal.quick import quick_rehearsal  # noqa: E402
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record  # noqa: E402
 from experiments.blind.scenes import ROLES as ROLES_THERE  # noqa: E402
 from experiments.blind.scenes import Setting, setting  # noqa: E402

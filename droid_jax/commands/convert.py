@@ -100,7 +100,7 @@ def run(command: Convert) -> None:
     """Load whatever it is, validate, cut, and save."""
     from droid_jax.recordings.formats import bags_at, check_target, load_recording, rosbag_reader, save_recording
     from droid_jax.recordings.log_files import is_log
-    from droid_jax.recordings.torque_constants import with_torque_constants
+    from droid_jax.recordings.units import with_torque_constants
 
     check_target(command.out)  # before logs are read, which may take long
     if not command.source:

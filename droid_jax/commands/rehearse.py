@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
     from droid_jax.rehearsal.linear import RehearsalConfig
+    from droid_jax.rehearsal.linearised import Rehearsed
     from droid_jax.rehearsal.plan import RehearsalPlan
-    from droid_jax.rehearsal.quick import Rehearsed
 
 DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
 

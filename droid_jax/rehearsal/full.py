@@ -31,6 +31,7 @@ from droid_jax.read_json import read_json
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
 from droid_jax.rehearsal.linear import RehearsalConfig
+from droid_jax.rehearsal.linearised import Rehearsed
 from droid_jax.rehearsal.plan import (
     HiddenCase,
     RehearsalPlan,
@@ -39,7 +40,7 @@ from droid_jax.rehearsal.plan import (
     robot_trace,
     simulated_channels,
 )
-from droid_jax.rehearsal.quick import Rehearsed, hidden_directions, robot_whitened
+from droid_jax.rehearsal.quick import hidden_directions, robot_whitened
 from droid_jax.storage import write_json
 
 SPREAD = 0.5  # prior deviations by which parameters of interest are drawn

@@ -360,7 +360,7 @@ def distinguishable(model: LinearModel, config: DiscrepancyConfig, share: float)
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """A candidate that an effect may be taken for.
 
     key: of it.  share: of the effect's squared sensitivity that it takes too, within its bounds.  apart: size of the
@@ -372,7 +372,9 @@ class Rival:
     apart: float
 
 
-def rivals_of(model: LinearModel, k: int, size: float, config: DiscrepancyConfig, share: float) -> list[Rival]:
+def alternatives_of(
+    model: LinearModel, k: int, size: float, config: DiscrepancyConfig, share: float
+) -> list[Alternative]:
     """The candidates that the search would not distinguish from direction k at some size, the nearest first.
 
     By the search's own criterion: the worse of two models is worse in nearly all resamples of the validation
@@ -381,7 +383,7 @@ def rivals_of(model: LinearModel, k: int, size: float, config: DiscrepancyConfig
     Args:
         model: the linear model.
         k: the direction.
-        size: of the effect, where its rivals' bounds are looked at.
+        size: of the effect, where the alternatives' bounds are looked at.
         config: of the search.
         share: of rehearsals in which they must be distinguished.
     """
@@ -394,7 +396,7 @@ def rivals_of(model: LinearModel, k: int, size: float, config: DiscrepancyConfig
         strength = left * imitation.strength
         apart = float(np.sqrt(needed / strength)) if left > 1e-9 else np.inf
         if apart > size:
-            out.append(Rival(imitation.key, imitation.share, apart if apart <= model.room[k] else np.inf))
+            out.append(Alternative(imitation.key, imitation.share, apart if apart <= model.room[k] else np.inf))
     return sorted(out, key=lambda r: -r.share)
 
 

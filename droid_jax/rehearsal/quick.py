@@ -1,65 +1,46 @@
-"""The quick form: what would be found and recovered, from sensitivities alone, without a search.
-
-The search's own case is made of the recordings, or of what the replay and a stated noise make of their commands.
-Parameters stand where they are known; each candidate effect is simulated once with a small coefficient.
-"""
+"""The quick form: what would be found and recovered, from sensitivities alone, without a search."""
 
 from __future__ import annotations
 
-import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from droid_jax import runtime
-from droid_jax.cost.channels import SIMULATED
-from droid_jax.cost.cost import make_cost
-from droid_jax.cost.windowed_log import WindowedLog
-from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
-from droid_jax.discrepancy.case import Case, ResidualSet, comparing
+from droid_jax.discrepancy.candidates import sensitivities
+from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, with_finer_step, with_step_difference
-from droid_jax.discrepancy.log_case import base_model, case_of, least_residual
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
-from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import RefineConfig, Refined
-from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect, Rollout
-from droid_jax.model.effects.candidate import candidates
-from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
-from droid_jax.model.scene import Scene, with_options
+from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
-from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
+from droid_jax.recordings.split import Split
 from droid_jax.rehearsal.linear import (
     LinearModel,
-    LinearPart,
     RehearsalConfig,
+    alternatives_of,
     distinguishable,
     leftover_of,
-    rivals_of,
     taken_by,
 )
+from droid_jax.rehearsal.linearised import Rehearsed, one_shape_each, rehearsed
 from droid_jax.rehearsal.plan import (
-    ColumnNoise,
     HiddenCase,
     RehearsalPlan,
     faster_motion,
     hidden_form,
-    noise_of_log,
-    planned_recording,
     robot_trace,
-    simulated_channels,
 )
 from droid_jax.rehearsal.power import smallest_sizes
-from droid_jax.simulate.replay import Drive
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
 ROUGHLY = 5  # iterations of a base fit whose residual is taken for noise
@@ -67,295 +48,9 @@ FINE = (8, 32)  # parts of a time step
 Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Rehearsed:
-    """A linear model with what it came from.
-
-    split, case, roles: of the search.  base: the base parameters where they are known, with their slopes.
-    model: of all channels that are known or assumed.  compared: those that the search compares.  noise: of each column.
-    """
-
-    split: Split
-    case: Case
-    roles: Mapping[str, Recording]
-    base: FittedModel
-    model: LinearModel
-    compared: tuple[str, ...]
-    noise: tuple[ColumnNoise, ...]
-    seconds: Mapping[str, float]
-
-
-def rehearsed(
-    scene: Scene,
-    space: Space,
-    effects: Sequence[Effect],
-    recordings: Sequence[Recording],
-    plan: RehearsalPlan,
-    config: DiscrepancyConfig,
-    rehearsal: RehearsalConfig,
-    tell: Tell = lambda stage: None,
-    *,
-    step_error: bool = True,
-    train_only: bool = False,
-) -> Rehearsed:
-    """The linear model of a search in these recordings.
-
-    Args:
-        scene: the robot.
-        space: all that is fitted without any effect.
-        effects: that could be hidden.
-        recordings: as given to the search.
-        plan: what is planned beside what was measured.
-        config: of the search.
-        rehearsal: what is assumed.
-        tell: called with each stage's name.
-        step_error: whether to measure what the time step leaves.
-        train_only: take the training part for the validation part too, and of each coefficient one shape; of recordings
-            with repeats.
-
-    Raises:
-        ValueError: what the search refuses too, or a simulation that blows up.
-    """
-    clock = _Stopwatch(tell)
-    clock("compile")
-    effects = beside(space, effects)
-    start = space.values(dict(plan.values or {}))
-    whole = joined(space, effects)
-    at = whole.embed(space, start[None])[0]
-    config = replace(config, channels=plan.channels or config.channels)
-    clean = clean_channels(scene, space, whole, effects, at, plan, config)
-    made, noise = _made(clean, scene, recordings[:1] if train_only else recordings, plan, rehearsal)
-    chosen = _compared(scene, recordings, made, plan, config)
-    halves = Split.RECORDINGS if len(recordings) > 1 else Split.REPEATS
-    split = halves if train_only else split_of(made)
-    roles = roles_of(split, made)
-    every = chosen if split in (Split.WINDOWS, Split.BLOCKS) or not made[0].command.size else _alike(made)
-    clock("case")
-    needed = {k: r for k, r in roles.items() if split is not Split.RECORDINGS or k != "test"}
-    if train_only:
-        needed = {"train": roles["train"], "validation": roles["train"]}
-    refine = replace(config.refine, iterations=min(config.refine.iterations, ROUGHLY))  # of windows, which are fitted
-    case = case_of(split, scene, space, effects, needed, replace(config, channels=every, refine=refine))
-    values = whole.embed(space, start[None])[0] if case.start is None or plan.values or plan.simulated else case.start
-    clock("base")
-    if split is Split.BLOCKS:
-        base = base_model(case)
-        values, slopes = base.values, base.refined.jacobian
-    else:
-        base, slopes = known_base(case.train, case.base, values)
-    clock("sensitivities")
-    directions = directions_of(candidates(case.effects))
-    if train_only:
-        directions = tuple(directions[k] for k in one_shape_each(directions))
-    free = base.refined.free
-    train = part_of(case.train, base, slopes[:, free], directions)
-    validation = train
-    if split is not Split.REPEATS and not train_only:
-        beside_base, slopes = known_base(case.validation, case.base, values, spreads=0)
-        validation = part_of(case.validation, beside_base, slopes[:, free], directions)
-    if not train.rows.repeated:
-        share = unexplained_share(case, base, train, directions)
-        train, validation = train.quieter(share), validation.quieter(share)
-    elif step_error:
-        clock("step error")
-        with contextlib.suppress(NotReplayed):
-            train = replace(train, step=fine_steps(case.train, base, case.base, roles["train"]))
-    clock("")
-    model = linear_model(case, base, directions, train, validation)
-    return Rehearsed(split, case, roles, base, model, chosen, tuple(noise), clock.seconds)
-
-
-Clean = Callable[[Recording], Rollout]  # what a recording's commands make of the robot, without noise
-
-
-def clean_channels(
-    scene: Scene,
-    space: Space,
-    whole: Space,
-    effects: Sequence[Effect],
-    at: np.ndarray,
-    plan: RehearsalPlan,
-    config: DiscrepancyConfig,
-) -> Clean:
-    """The replay without noise at values `at` [D]: in plain C where only the noise of the repeats will count.
-
-    A mean of the repeats that is a little off changes nothing then: what is missing is looked for along slopes.
-    """
-
-    def simulated(recording: Recording) -> Rollout:
-        if (plan.repeats or recording.repeats) >= FEWEST_REPEATS:
-            with contextlib.suppress(ValueError):  # of what plain C does not have
-                return simulated_channels(scene, space, (), recording, at[whole.columns(space)], config, "mujoco")
-        return simulated_channels(ready(scene), whole, effects, recording, at, config)
-
-    return simulated
-
-
-def known_base(
-    residual_set: ResidualSet, base: Space, values: np.ndarray, spreads: int = 1
-) -> tuple[FittedModel, np.ndarray]:
-    """The base model at known values [D], with the slopes that a fit has; and [M, D] slopes along each axis.
-
-    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
-    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
-    may absorb of an effect is told by the steps along one axis.
-
-    spreads: see `LevenbergMarquardtConfig.spreads`.
-    """
-    whole, config = residual_set.cost.space, replace(AT_REST, spreads=spreads)
-
-    def residuals(rows: np.ndarray) -> np.ndarray:
-        return residual_set.whitened(whole.embed(base, rows, values))
-
-    problem = DampedProblem(residuals, base, config)
-    state, slopes = problem.start_with_slopes(problem.inside(base.to_search(values[None, whole.columns(base)])))
-    if not np.isfinite(state.objective[0]):
-        name = residual_set.comparison.name
-        raise NotReplayed(f"the simulation of {name!r} blows up at the parameters' values: begin at other ones")
-    x = state.x[0]
-    refined = Refined(
-        base, x, base.from_search(x), float(state.objective[0]), state.residual[0],
-        problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
-    )  # fmt: skip
-    rows = residual_set.resampling
-    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
-    at = whole.embed(base, refined.best[None], values)[0]
-    return FittedModel((), at, base, refined, left, rows.discrepancy(left)), slopes[0]
-
-
-def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recording: Recording) -> np.ndarray | None:
-    """[M] what far finer time steps change of the base model, in one repeat's noise; None in inverse mode.
-
-    In plain C, where nothing is compiled.  Its error is of first order in the step: of two steps' it is extrapolated
-    to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.
-    """
-    known = residual_set.cost
-    if not isinstance(known.drives[0], Drive) or isinstance(known, WindowedLog):
-        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
-    config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
-    try:
-        coarse, fine = (
-            make_cost(
-                with_options(known.scene, timestep=timestep / parts), base, [recording], engine="mujoco", config=config,
-                check=False,
-            )
-            for parts in FINE
-        )  # fmt: skip
-    except ValueError:
-        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
-    near, nearer = (with_step_difference(residual_set, model, cost).step_difference for cost in (coarse, fine))
-    assert near is not None and nearer is not None
-    return nearer + (nearer - near) / (FINE[1] / FINE[0] - 1)
-
-
-def _made(
-    clean: Clean, scene: Scene, recordings: Sequence[Recording], plan: RehearsalPlan, rehearsal: RehearsalConfig
-) -> tuple[list[Recording], list[ColumnNoise]]:
-    """The recordings to rehearse, and the noise of the first one's columns.
-
-    Logs that are cut in time stay as they are: their noise is what fits leave of them.
-    """
-    commanded = all(r.command.size for r in recordings)
-    if not commanded and plan.simulated:
-        raise ValueError("a log without commands prescribes its motion: its noise and repeats are measured, not stated")
-    if not plan.simulated and (not commanded or split_of(recordings) is Split.WINDOWS):
-        return list(recordings), noise_of_log(recordings[0])
-    made = list[Recording]()
-    noise = list[ColumnNoise]()
-    for i, recording in enumerate(recordings):
-        full, each = planned_recording(scene, recording, clean(recording), plan, rehearsal, rehearsal.seed + i)
-        made.append(full)
-        noise = noise or each
-    return made, noise
-
-
-def _compared(
-    scene: Scene, given: Sequence[Recording], made: Sequence[Recording], plan: RehearsalPlan, config: DiscrepancyConfig
-) -> tuple[str, ...]:
-    """The channels that the search would compare: those asked for, else of what is measured."""
-    if config.channels:
-        return tuple(n for n in SIMULATED if n in config.channels)
-    if plan.noise:  # what is stated is what will be measured
-        named = [n for n in SIMULATED if n in plan.noise and all(n in r.channels for r in made)]
-        if named:
-            kept = [replace(r, channels={n: r.channels[n] for n in named}) for r in made]
-            return tuple(comparing(scene, kept, config).compare.channels)
-    return tuple(comparing(scene, given, config).compare.channels)
-
-
-def _alike(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Channels that all of them have."""
-    return tuple(n for n in SIMULATED if all(n in r.channels for r in recordings))
-
-
-def part_of(
-    residual_set: ResidualSet, base: FittedModel, slopes: np.ndarray, directions: Sequence[ScoreDirection]
-) -> LinearPart:
-    """A part of the recordings in the linear model, at the values of `base`; slopes: [M, D] of its residual."""
-    names = [c.name for c in residual_set.comparison.channels for _ in range(len(c.columns))]
-    channel = np.array(names)[residual_set.column]
-    raw = sensitivities(residual_set, base.values, directions)
-    rows, slopes = residual_set.resampling, slopes / residual_set.repeats**0.5
-    if rows.repeated:
-        return LinearPart(raw, slopes, rows, channel)
-    left = base.residuals.mean(axis=0)
-    return LinearPart(raw, slopes, rows, channel, base.discrepancy, residual=left, column=residual_set.column)
-
-
-def unexplained_share(case: Case, base: FittedModel, train: LinearPart, directions: Sequence[ScoreDirection]) -> float:
-    """How much of a log's residual stays where the best candidates have taken theirs, of its root mean square.
-
-    What the base model leaves of a real log holds the very effects that are looked for.  Taken whole for noise, it hid
-    a servo's friction that the search then named.
-    """
-    raw, held = np.nan_to_num(train.raw), base.refined.prior[base.refined.free] * case.train.prior_slack
-    projected = project(raw, train.base, held)
-    rows = case.train.resampling
-    found = scored(
-        base.residuals, directions, raw, projected, lambda s: rows.largest_score(s, projected, train.base, held)
-    )
-    left = base.residuals.mean(axis=0)
-    least = least_residual(found, left, case.full_space, case.config)
-    return float(np.linalg.norm(least) / max(np.linalg.norm(left), 1e-30))
-
-
-def linear_model(
-    case: Case,
-    base: FittedModel,
-    directions: Sequence[ScoreDirection],
-    train: LinearPart,
-    validation: LinearPart,
-) -> LinearModel:
-    """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
-    space, minimum, refined = case.full_space, case.minimum_sizes, base.refined
-    room = [base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high)]
-    of = [space[d.coefficient] for d in directions]
-    return LinearModel(
-        directions=tuple(directions),
-        train=replace(train, raw=np.nan_to_num(train.raw)),
-        validation=replace(validation, raw=np.nan_to_num(validation.raw)),
-        prior=refined.prior[refined.free],
-        slack=case.train.prior_slack,
-        repeats=case.train.resampling.units if case.train.resampling.repeated else 1,
-        minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
-        low=np.array([p.low - p.mean for p in of]),
-        high=np.array([p.high - p.mean for p in of]),
-        base_low=room[0][refined.free],
-        base_high=room[1][refined.free],
-    )
-
-
 def hidden_directions(model: LinearModel) -> list[int]:
     """Of each coefficient at each place one direction (`one_shape_each`)."""
     return one_shape_each(model.directions)
-
-
-def one_shape_each(directions: Sequence[ScoreDirection]) -> list[int]:
-    """Of each coefficient at each place one direction: in the middle of the shapes that are tried."""
-    groups: dict[str, list[int]] = {}
-    for k, direction in enumerate(directions):
-        groups.setdefault(direction.coefficient, []).append(k)
-    return [rows[len(rows) // 2] for rows in groups.values()]
 
 
 def parameter_identifiability(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
@@ -384,7 +79,7 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
     out = []
     for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config.selection), strict=True):
         direction, p = model.directions[k], space[model.directions[k].coefficient]
-        rivals = rivals_of(model, k, size.size, config, rehearsal.share)
+        others = alternatives_of(model, k, size.size, config, rehearsal.share)
         out.append(
             {
                 "effect": direction.candidate.effect,
@@ -400,7 +95,7 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
                 "noncentrality": size.noncentrality,
                 "taken_for": [
                     {"effect": r.key.effect, "location": r.key.location, "share": r.share, "below": r.apart}
-                    for r in rivals
+                    for r in others
                 ],
             }
         )
@@ -463,11 +158,15 @@ def law_checks(
         left = leftover_of(model, difference[seen], np.zeros(len(model.validation.base)), 1.0)
         taken = taken_by(model, left.at(1.0)[0], left.free[-1])
         own = max(v for key, v in taken.items() if (key.effect, key.location) == _place(known[i]))
-        rival = max(taken, key=taken.__getitem__)
-        apart = known[i]["noncentrality"] ** 2 * (taken[rival] - own)
+        alternative = max(taken, key=taken.__getitem__)
+        apart = known[i]["noncentrality"] ** 2 * (taken[alternative] - own)
         confused = apart > distinguishable(model, config, rehearsal.share)
-        confused &= 1 - own > config.selection.equivalence_factor * (1 - taken[rival])
-        other = {"effect": rival.effect, "location": rival.location, "share": taken[rival]} if confused else None
+        confused &= 1 - own > config.selection.equivalence_factor * (1 - taken[alternative])
+        other = (
+            {"effect": alternative.effect, "location": alternative.location, "share": taken[alternative]}
+            if confused
+            else None
+        )
         before, sure = out[i], bool(own >= rehearsal.known and not confused)
         if before is None or (own < before["own"] and not (before["sure"] is False and sure)):
             out[i] = {"law": law, "own": own, "other": other, "sure": sure}
@@ -687,19 +386,3 @@ def quick_rehearsal(
         "seconds": {**dict(found.seconds), "whole": time.monotonic() - began, "cpu": time.process_time() - used},
     }
     return found, answer
-
-
-class _Stopwatch:
-    """Seconds of each stage."""
-
-    def __init__(self, tell: Tell) -> None:
-        self.tell, self.seconds = tell, dict[str, float]()
-        self._stage, self._since = "", time.monotonic()
-
-    def __call__(self, stage: str) -> None:
-        now = time.monotonic()
-        if self._stage:
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-        self._stage, self._since = stage, now
-        if stage:
-            self.tell(stage)

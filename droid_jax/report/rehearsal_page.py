@@ -12,7 +12,7 @@ from droid_jax.report.style import AFTER, BEFORE, MUTED, WIDE, inline_svg, settl
 from droid_jax.report.text import counted, html, label, listed, percent, quantity
 
 Result = Mapping[str, Any]
-MOST_RIVALS = 3
+MOST_ALTERNATIVES = 3
 MOST, MOST_PAIRS, MOST_NAMES = 6, 3, 3  # things that a sentence lists
 KNOWN = ("N m", "N", "kg", "m", "rad", "s")  # units of sizes that people have a feeling for
 NEAR = 2.0  # times the minimum effect size
@@ -68,22 +68,22 @@ def effect_rows(result: Result) -> list[tuple[str, ...]]:
     for e in best_of(result):
         size = "not found" if e["smallest"] is None else quantity(e["smallest"], e["unit"], 2)
         size = size if _sure(e) else f"{size}, doubtful"
-        rows.append((label(e["effect"]), label(e["location"]), size, e["limit"], _rivals(e)))
+        rows.append((label(e["effect"]), label(e["location"]), size, e["limit"], _alternatives(e)))
     return rows
 
 
-def _rivals(entry: Mapping[str, Any]) -> str:
+def _alternatives(entry: Mapping[str, Any]) -> str:
     said = []
     law = entry.get("law") or {}
     if law.get("other"):
         other = law["other"]
         why = "beyond small sizes" if law["law"] == "the library's" else "with another law"
         said.append(f"{_thing(other)} ({why})")
-    for rival in entry["taken_for"][:MOST_RIVALS]:
-        name = f"{label(rival['effect']).lower()} at {label(rival['location']).lower()}"
-        below = rival["below"]
+    for other in entry["taken_for"][:MOST_ALTERNATIVES]:
+        name = f"{label(other['effect']).lower()} at {label(other['location']).lower()}"
+        below = other["below"]
         said.append(f"{name} (at any size)" if below is None else f"{name} (below {quantity(below, entry['unit'], 2)})")
-    more = len(entry["taken_for"]) - MOST_RIVALS
+    more = len(entry["taken_for"]) - MOST_ALTERNATIVES
     return ", ".join(said) + (f" and {more} more" if more > 0 else "")
 
 
@@ -213,10 +213,10 @@ def _by_effect(entries: list[dict[str, Any]], every: list[dict[str, Any]]) -> st
 def _alike(found: list[dict[str, Any]]) -> str:
     pairs = dict[frozenset[str], str]()
     for e in found:
-        for rival in e["taken_for"]:
-            if rival["below"] is None:
-                both = frozenset((_thing(e), _thing(rival)))
-                pairs.setdefault(both, f"{_thing(e)} as {_thing(rival)}")
+        for other in e["taken_for"]:
+            if other["below"] is None:
+                both = frozenset((_thing(e), _thing(other)))
+                pairs.setdefault(both, f"{_thing(e)} as {_thing(other)}")
     return "; ".join(list(pairs.values())[:MOST_PAIRS]) + (" and others" if len(pairs) > MOST_PAIRS else "")
 
 

@@ -40,10 +40,11 @@ from droid_jax.rehearsal.full import (
     scores,
     synthetic_log,
 )
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, leftover, rivals_of
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, leftover
+from droid_jax.rehearsal.linearised import fine_steps, rehearsed
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import smallest_sizes
-from droid_jax.rehearsal.quick import fine_steps, quick_rehearsal, rehearsed
+from droid_jax.rehearsal.quick import quick_rehearsal
 from droid_jax.report.rehearsal_page import rehearsal_sentences
 from droid_jax.run import main
 
@@ -185,7 +186,7 @@ def test_a_parameter_absorbs_an_effect_only_as_far_as_its_bounds():
     assert tight.size < 0.8 * loose.size
 
 
-def test_rivals_are_the_candidates_that_act_alike():
+def test_alternatives_are_the_candidates_that_act_alike():
     """Of two directions with a cosine of 0.99 each is taken for the other, up to a size; of others, none at it."""
     model = of_repeats()
     raw = model.train.raw.copy()
@@ -193,15 +194,15 @@ def test_rivals_are_the_candidates_that_act_alike():
     part = LinearPart(raw, model.train.base, model.train.rows, model.train.channel)
     near = of_repeats(train=part, validation=part)
     (size,) = smallest_sizes(near, [0], CONFIG)
-    rivals = rivals_of(near, 0, size.size, DiscrepancyConfig(), CONFIG.share)
-    assert rivals[0].key.effect == "effect1" and rivals[0].share > 0.9
-    assert size.size < rivals[0].apart < np.inf
-    apart = [r.key.effect for r in rivals_of(near, 0, 2 * rivals[0].apart, DiscrepancyConfig(), CONFIG.share)]
+    others = alternatives_of(near, 0, size.size, DiscrepancyConfig(), CONFIG.share)
+    assert others[0].key.effect == "effect1" and others[0].share > 0.9
+    assert size.size < others[0].apart < np.inf
+    apart = [r.key.effect for r in alternatives_of(near, 0, 2 * others[0].apart, DiscrepancyConfig(), CONFIG.share)]
     assert "effect1" not in apart
     one_way = np.zeros(DIRECTIONS)
     low = of_repeats(train=part, validation=part, low=one_way, high=np.where(np.arange(DIRECTIONS) == 1, 1e-9, np.inf))
     assert "effect1" not in [
-        r.key.effect for r in rivals_of(low, 0, size.size, DiscrepancyConfig(), 0.9) if r.share > 0.9
+        r.key.effect for r in alternatives_of(low, 0, size.size, DiscrepancyConfig(), 0.9) if r.share > 0.9
     ]
 
 
