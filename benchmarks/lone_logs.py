@@ -96,7 +96,7 @@ HIDDEN = {
     ),
 }  # fmt: skip
 SETUP = {  # what is wrong with the set-up, not with the machine; of torques alone what only their sensors show
-    "hinge": ("clock_rate", "command_delay"),
+    "hinge": ("clock_rate",),  # a delay of the commands is its base's own time offset
     "arm": ("tilted_base", "encoder_zero[elbow]", "clock_rate", "held_thing", "inner_profile[shoulder]",
             "torque_gain[shoulder]", "crosstalk[elbow]", "mesh_friction[shoulder]"),
 }  # fmt: skip
