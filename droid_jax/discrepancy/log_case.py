@@ -144,9 +144,11 @@ def noise_of(
     """What to state as the noise of a log, and how long its blocks are, from what lies before `end`.
 
     One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual that
-    an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, where that is less
-    than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base leaves.  The fifth
-    is there because the best of many candidates takes noise too, and what it leaves is correlated for too short a time.
+    an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, in columns where
+    that is less than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base
+    leaves.  The fifth is there because the best of many candidates takes noise too, and what it leaves is correlated
+    for too short a time.  It is asked of each column: a clock at another rate shows in positions, and a torque sensor's
+    noise stays whatever explains them.
     So with something missing that the library explains in part only, noise is stated too large and blocks are long:
     intervals are wide and less is named.  A discrepancy in these units is no absolute size, but ratios of
     discrepancies are free of the unit.
@@ -158,15 +160,22 @@ def noise_of(
         start = _rough_fit(log, base, effects, log.space.mean, block, config)[1].values
     case, model, deviation = _rough_fit(log, base, effects, start, block, config)
     found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
-    whole = model.residuals.mean(axis=0)
-    least = least_residual(found, whole, log.space, config)
-    noise = least if least @ least < config.blocks.noise_share * (whole @ whole) else whole
-    left, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in (noise, least))
+    common = model.residuals.mean(axis=0)
+    both = common, least_residual(found, common, log.space, config)
+    whole, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in both)
+    left = noise_left(whole, rest, config.blocks.noise_share)
     rate = config.compare.noise.rate
     stated = stated_deviation(left, log.moves[inside], rate)
     # Each window begins at its own measured state, so that what they leave of slow noise is short.
     lasting = rest if isinstance(log, WindowedLog) else left
     return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
+
+
+def noise_left(whole: np.ndarray, least: np.ndarray, share: float) -> np.ndarray:
+    """[K, C] what counts as noise of each column: what the best candidates leave, where that is less than a share of
+    the base model's residual `whole` [K, C], in squares.
+    """
+    return np.where(np.sum(least**2, axis=0) < share * np.sum(whole**2, axis=0), least, whole)
 
 
 def _rough_fit(

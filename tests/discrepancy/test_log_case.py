@@ -12,7 +12,7 @@ from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elb
 
 from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
-from droid_jax.discrepancy.log_case import base_model, make_log, single_case
+from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, single_case
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
@@ -83,6 +83,16 @@ def test_each_joint_of_a_test_log_has_its_own_noise():
     assert case.test is not None and list(deviations(case.test)) != list(deviations(case.train))
     assert deviations(case.test) == deviations(case.validation) == deviations(case.train)
     assert deviations(case.train)[1] > 1.5 * deviations(case.train)[0]
+
+
+def test_noise_is_what_candidates_leave_in_the_columns_that_they_explain():
+    """The noise of one sensor does not hide that another's residual is explained."""
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(200, 2)) * [1.0, 0.1]
+    whole = noise + np.sin(np.linspace(0.0, 9.0, 200))[:, None] * [0.0, 1.0]
+    left = noise_left(whole, noise, 0.2)
+    assert np.array_equal(left, noise)
+    assert np.array_equal(noise_left(whole, 0.5 * whole, 0.2), whole)
 
 
 def two_joints() -> Scene:
