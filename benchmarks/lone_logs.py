@@ -375,6 +375,7 @@ def main(arguments: Arguments) -> None:
         },
         "by_factor": {f"{f:g}": summary([c for c in cases if c["factor"] == f]) for f in FACTORS},
         "codes": sorted({str(c["code"]) for c in cases}),
+        **({"false_names": whole["false_name_rate"]} if arguments.hidden == "setup" else {}),
         "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows_s": arguments.windows},
         "blind_cases": [{k: c.get(k) for k in ("name", "effect", "factor", "verdict", "effects", "indistinguishable",
                                                "named", "wrong", "p", "ranked")} for c in cases if c["effect"]],
