@@ -263,8 +263,8 @@ def final_refit(
 def fit_posterior(residual_set: ResidualSet, model: FittedModel) -> Gaussian:
     """What the fitted recording says of a model's parameters, over its space (`posterior_of`), its time step's part
     among it where that was measured (`with_step_difference`)."""
-    told = posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
-    return with_step_moves(residual_set, model, told)
+    gaussian = posterior_of(model.refined, residual_set.cost.comparisons, residual_set.identifiability)
+    return with_step_moves(residual_set, model, gaussian)
 
 
 def with_step_moves(residual_set: ResidualSet, model: FittedModel, gaussian: Gaussian) -> Gaussian:
@@ -340,7 +340,7 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
     Args:
         residual_set: of the recording that the model was fitted to.
         model: the base model.
-        fine: what `with_finer_step` made of the same recording; None leaves the set as it is.
+        fine: what `with_finer_step` made of the same recording; None leaves the set unchanged.
 
     Raises:
         NotReplayed: the finer replay blows up.

@@ -31,7 +31,7 @@ from droid_jax.read_json import read_json
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
 from droid_jax.rehearsal.linear import RehearsalConfig
-from droid_jax.rehearsal.linearised import Rehearsed
+from droid_jax.rehearsal.linearised import Rehearsed, one_shape_each
 from droid_jax.rehearsal.plan import (
     HiddenCase,
     RehearsalPlan,
@@ -40,7 +40,7 @@ from droid_jax.rehearsal.plan import (
     robot_trace,
     simulated_channels,
 )
-from droid_jax.rehearsal.quick import hidden_directions, robot_whitened
+from droid_jax.rehearsal.quick import robot_whitened
 from droid_jax.storage import write_json
 
 SPREAD = 0.5  # prior deviations by which parameters of interest are drawn
@@ -149,7 +149,7 @@ def equally_strong(
     for rows in groups.values():
         span, _ = np.linalg.qr(sensitivities[rows].T)
         best = max(best, float(np.linalg.norm(span.T @ left)))
-    own = [k for k in hidden_directions(part) if part.directions[k].coefficient == case.coefficient]
+    own = [k for k in one_shape_each(part.directions) if part.directions[k].coefficient == case.coefficient]
     if not own or best <= 0 or not np.isfinite(best):
         return case
     factor = case.size * float(np.linalg.norm(sensitivities[own[0]])) / best

@@ -80,8 +80,9 @@ class RehearsalConfig:
 class LinearPart:
     """One part of the recordings (training or validation) in a linear model.
 
-    raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat.  base: [M, D] what a search unit of
-    each base parameter adds.  rows: what is resampled.  channel: [M] name of the channel of each residual.
+    raw: [K, M] what a unit of each coefficient adds, in noise units of one repeat; zero where its replay blew up.
+    base: [M, D] what a search unit of each base parameter adds.  rows: what is resampled.  channel: [M] name of the
+    channel of each residual.
     level: mean square of the residual where nothing is missing, of rows that are blocks.
     residual: [M] of the base model, whose colour the noise of blocks has; None: white noise of deviation one.
     column: [M] number of the compared column of each residual.
@@ -154,7 +155,7 @@ class LinearModel:
     base_high: np.ndarray | None = None
 
     @property
-    def room(self) -> np.ndarray:
+    def largest(self) -> np.ndarray:
         """[K] largest size of each coefficient: upwards, or downwards where neutral is the upper bound."""
         return np.where(self.high > 0, self.high, -self.low)
 
@@ -196,7 +197,7 @@ class LinearModel:
     def absorbed(self) -> np.ndarray:
         """[D, K] by how much a unit moves the base parameters that are fitted to the training part, without bounds."""
         base, held = self.train.base, self.held(1.0)
-        return np.linalg.solve(base.T @ base + np.diag(held**-2), base.T @ np.nan_to_num(self.train.raw).T)
+        return np.linalg.solve(base.T @ base + np.diag(held**-2), base.T @ self.train.raw.T)
 
     def inside(self, moved: np.ndarray) -> bool:
         """Whether base parameters that moved by so much [D] are within their bounds."""
@@ -204,19 +205,15 @@ class LinearModel:
             return True
         return bool(np.all((moved >= self.base_low) & (moved <= self.base_high)))
 
-    def unabsorbed(self) -> np.ndarray:
-        """[K, M] what a unit adds to the validation part once the base is fitted to the training part."""
-        return self.validation.raw - (self.validation.base @ self.absorbed).T
-
     @cached_property
     def loosest(self) -> np.ndarray:
         """[K, M] what the base parameters, with their priors alone, leave of each sensitivity."""
-        return project(np.nan_to_num(self.train.raw), self.train.base, self.held(1.0))
+        return project(self.train.raw, self.train.base, self.held(1.0))
 
     @cached_property
     def added(self) -> np.ndarray:
-        """[K, M] `unabsorbed`, zero where a replay blew up."""
-        return np.nan_to_num(self.unabsorbed())
+        """[K, M] what a unit adds to the validation part once the base is fitted to the training part."""
+        return self.validation.raw - (self.validation.base @ self.absorbed).T
 
     @cached_property
     def products(self) -> np.ndarray:
@@ -231,8 +228,7 @@ class LinearModel:
         """[K, M] what base parameters free [D] leave of each sensitivity, and the products [K, K] of these."""
         key = free.tobytes()
         if key not in self._beside:
-            raw, held = np.nan_to_num(self.train.raw), self.held(self.slack)[free]
-            columns = project(raw, self.train.base[:, free], held)
+            columns = project(self.train.raw, self.train.base[:, free], self.held(self.slack)[free])
             self._beside[key] = columns, columns @ columns.T
         return self._beside[key]
 
@@ -256,14 +252,14 @@ class Leftover:
     begins: [P] sizes at which one more of the parameters has come to a bound, the first 0.
     train, validation: [P, 2, M] of each piece what is left at size 0 and what each unit adds: of the score test's
       residual, and on the validation part of a model that was fitted without the effect.
-    free: [P, D] bool, the parameters that are not at a bound.  room: the largest size.
+    free: [P, D] bool, the parameters that are not at a bound.  largest: of the sizes.
     """
 
     begins: np.ndarray
     train: np.ndarray
     validation: np.ndarray
     free: np.ndarray
-    room: float
+    largest: float
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
         """[M] of the training part, and of the validation part."""
@@ -275,7 +271,7 @@ class Leftover:
     def norms(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Sizes, and how large what is left is on each part at these; never smaller than at a smaller size."""
         slope = max(float(np.linalg.norm(self.train[-1, 1])), 1e-30)
-        ends = np.append(self.begins[1:], max(min(self.room, FAR / slope), 2 * self.begins[-1]))
+        ends = np.append(self.begins[1:], max(min(self.largest, FAR / slope), 2 * self.begins[-1]))
         sizes = np.concatenate([np.linspace(a, b, POINTS) for a, b in zip(self.begins, ends, strict=True)])
         pieces = np.repeat(np.arange(len(ends)), POINTS)
         out = []
@@ -295,10 +291,10 @@ class Leftover:
 def leftover(model: LinearModel, k: int) -> Leftover:
     """What the base parameters leave of direction k (`leftover_of`)."""
     raw, other = (model.sign[k] * part.raw[k] for part in (model.train, model.validation))
-    return leftover_of(model, raw, other, float(model.room[k]))
+    return leftover_of(model, raw, other, float(model.largest[k]))
 
 
-def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, room: float) -> Leftover:
+def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, largest: float) -> Leftover:
     """What the base parameters leave of something that adds raw [M] to the training part and other [M] to the other.
 
     They are fitted to it with their priors and within their bounds, along the way on which one after the other stops at
@@ -328,12 +324,12 @@ def leftover_of(model: LinearModel, raw: np.ndarray, other: np.ndarray, room: fl
         reached[~free] = np.inf
         reached = np.where(reached > begins[-1] * (1 + 1e-9), reached, np.inf)
         k_next = int(np.argmin(reached)) if count else 0
-        if not count or not reached[k_next] < room:
+        if not count or not reached[k_next] < largest:
             break
         free[k_next], at[k_next] = False, bound[k_next]
         begins.append(float(reached[k_next]))
     left, beside = (np.stack(part) for part in zip(*pieces, strict=True))
-    return Leftover(np.array(begins), left, beside, np.array(frees), room)
+    return Leftover(np.array(begins), left, beside, np.array(frees), largest)
 
 
 def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[EffectKey, float]:
@@ -352,11 +348,6 @@ def taken_by(model: LinearModel, left: np.ndarray, free: np.ndarray) -> dict[Eff
         share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
         out[key] = max(share, out.get(key, 0.0))
     return out
-
-
-def distinguishable(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
-    """Squared noncentrality that must stand between two models for the search to distinguish them."""
-    return _needed(model, config, share)
 
 
 @dataclass(frozen=True)
@@ -389,14 +380,14 @@ def alternatives_of(
     """
     if not np.isfinite(size):
         return []
-    needed = _needed(model, config, share)
+    needed = distinguishable(model, config, share)
     out = []
     for imitation in imitations(model, k, size):
         left = max(1.0 - imitation.share, 0.0)
         strength = left * imitation.strength
         apart = float(np.sqrt(needed / strength)) if left > 1e-9 else np.inf
         if apart > size:
-            out.append(Alternative(imitation.key, imitation.share, apart if apart <= model.room[k] else np.inf))
+            out.append(Alternative(imitation.key, imitation.share, apart if apart <= model.largest[k] else np.inf))
     return sorted(out, key=lambda r: -r.share)
 
 
@@ -483,7 +474,7 @@ def _within(gram: np.ndarray, toward: np.ndarray, low: np.ndarray, high: np.ndar
     return coefficients
 
 
-def _needed(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
+def distinguishable(model: LinearModel, config: DiscrepancyConfig, share: float) -> float:
     """Squared noncentrality that must stand between two models for the search to distinguish them."""
     selection = config.selection
     aside = float(scipy.stats.norm.isf(selection.equivalence_doubt) + abs(scipy.stats.norm.isf(share)))

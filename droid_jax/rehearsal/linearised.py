@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
-from droid_jax.cost.cost import make_cost
+from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
@@ -31,18 +31,8 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
-from droid_jax.rehearsal.linear import (
-    LinearModel,
-    LinearPart,
-    RehearsalConfig,
-)
-from droid_jax.rehearsal.plan import (
-    ColumnNoise,
-    RehearsalPlan,
-    noise_of_log,
-    planned_recording,
-    simulated_channels,
-)
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig
+from droid_jax.rehearsal.plan import ColumnNoise, RehearsalPlan, noise_of_log, planned_recording, simulated_channels
 from droid_jax.simulate.replay import Drive
 
 AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
@@ -182,7 +172,7 @@ def known_base(
 
     A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
     by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
-    may absorb of an effect is told by the steps along one axis.
+    may absorb of an effect shows in the steps along one axis.
 
     spreads: see `LevenbergMarquardtConfig.spreads`.
     """
@@ -213,21 +203,19 @@ def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recor
     In plain C, where nothing is compiled.  Its error is of first order in the step: of two steps' it is extrapolated
     to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.
     """
-    known = residual_set.cost
-    if not isinstance(known.drives[0], Drive) or isinstance(known, WindowedLog):
-        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
-    config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
-    try:
-        coarse, fine = (
-            make_cost(
-                with_options(known.scene, timestep=timestep / parts), base, [recording], engine="mujoco", config=config,
-                check=False,
-            )
-            for parts in FINE
-        )  # fmt: skip
-    except ValueError:
-        return with_step_difference(residual_set, model, with_finer_step(residual_set, base, recording)).step_difference
-    near, nearer = (with_step_difference(residual_set, model, cost).step_difference for cost in (coarse, fine))
+
+    def difference(finer: Cost | None) -> np.ndarray | None:
+        return with_step_difference(residual_set, model, finer).step_difference
+
+    known, costs = residual_set.cost, list[Cost]()
+    if isinstance(known.drives[0], Drive) and not isinstance(known, WindowedLog):
+        config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
+        scenes = [with_options(known.scene, timestep=timestep / parts) for parts in FINE]
+        with contextlib.suppress(ValueError):  # of what plain C does not have
+            costs = [make_cost(s, base, [recording], engine="mujoco", config=config, check=False) for s in scenes]
+    if not costs:
+        return difference(with_finer_step(residual_set, base, recording))
+    near, nearer = map(difference, costs)
     assert near is not None and nearer is not None
     return nearer + (nearer - near) / (FINE[1] / FINE[0] - 1)
 
@@ -312,7 +300,7 @@ def linear_model(
 ) -> LinearModel:
     """The linear model of a case; a direction whose replay blew up has sensitivity zero."""
     space, minimum, refined = case.full_space, case.minimum_sizes, base.refined
-    room = [base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high)]
+    low, high = (base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high))
     of = [space[d.coefficient] for d in directions]
     return LinearModel(
         directions=tuple(directions),
@@ -324,8 +312,8 @@ def linear_model(
         minimum=np.array([minimum.get(d.coefficient, 0.0) for d in directions]),
         low=np.array([p.low - p.mean for p in of]),
         high=np.array([p.high - p.mean for p in of]),
-        base_low=room[0][refined.free],
-        base_high=room[1][refined.free],
+        base_low=low[refined.free],
+        base_high=high[refined.free],
     )
 
 

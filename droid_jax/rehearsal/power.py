@@ -76,7 +76,7 @@ def smallest_sizes(
         each = np.maximum(np.max(list(drawn.values()), axis=0), max(fixed.values()))
         found = config.margin * float(np.quantile(each, config.share, method="higher"))
         limit = max(limits, key=limits.__getitem__)
-        if not found <= model.room[k]:
+        if not found <= model.largest[k]:
             found, limit = np.inf, "beyond its bounds"
         noncentrality = units * float(np.interp(found, *of.norms[:2])) if np.isfinite(found) else np.inf
         out.append(Smallest(found, limits, limit, noncentrality))
@@ -137,14 +137,18 @@ class ScoreDraws:
 
     def crossings(self, k: int, significance: float) -> np.ndarray:
         """[R] noncentrality of asked direction k from which each draw's score test rejects; inf where none does."""
-        rejects = self.tests(k, significance)
-        low, high = np.full(self.draws, np.log(LEAST)), np.full(self.draws, np.log(MOST))
-        ends = rejects(np.exp(high))
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            yes = rejects(np.exp(middle))
-            low, high = np.where(yes, low, middle), np.where(yes, middle, high)
-        return np.where(ends, np.exp(high), np.inf)
+        return _crossings(self.tests(k, significance), self.draws)
+
+
+def _crossings(passes: Rejects, draws: int) -> np.ndarray:
+    """[R] noncentrality from which each draw's test passes, by halving between LEAST and MOST; inf where none does."""
+    low, high = np.full(draws, LEAST), np.full(draws, MOST)
+    ends = passes(high)
+    for _ in range(HALVINGS):
+        middle = np.sqrt(low * high)
+        yes = passes(middle)
+        low, high = np.where(yes, low, middle), np.where(yes, middle, high)
+    return np.where(ends, high, np.inf)
 
 
 def representatives(unit: np.ndarray, close: float) -> np.ndarray:
@@ -158,7 +162,7 @@ def representatives(unit: np.ndarray, close: float) -> np.ndarray:
 
 def score_draws(model: LinearModel, config: RehearsalConfig, asked: np.ndarray) -> ScoreDraws:
     """Noise of the score test of a linear model, drawn `config.draws` times; asked: [A, M] what effects leave."""
-    rows, unit = model.train.rows, _units(np.concatenate([np.nan_to_num(model.projected()), asked]))
+    rows, unit = model.train.rows, _units(np.concatenate([model.projected(), asked]))
     shown, rng = representatives(unit[: -len(asked)], config.close), np.random.default_rng([config.seed, 1])
     if isinstance(rows, Repeats):
         return _of_repeats(model, unit, len(asked), shown, rng, config)
@@ -347,10 +351,4 @@ def _blocks_gain(
         t = t_values(gains, flips)
         return np.mean(t >= t[0] - 1e-12, axis=0) < selection.confirmation
 
-    low, high = np.full(len(noise), LEAST), np.full(len(noise), MOST)
-    ends = passes(high)
-    for _ in range(HALVINGS):
-        middle = np.sqrt(low * high)
-        yes = passes(middle)
-        low, high = np.where(yes, low, middle), np.where(yes, middle, high)
-    return np.maximum(np.where(ends, high, np.inf), least)
+    return np.maximum(_crossings(passes, len(noise)), least)

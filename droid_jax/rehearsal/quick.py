@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,7 +17,7 @@ from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import Identifiability, calibrated, identifiability, with_stated_prior
-from droid_jax.identify.multistart import RefineConfig, Refined
+from droid_jax.identify.multistart import Refined
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -32,7 +32,7 @@ from droid_jax.rehearsal.linear import (
     leftover_of,
     taken_by,
 )
-from droid_jax.rehearsal.linearised import Rehearsed, one_shape_each, rehearsed
+from droid_jax.rehearsal.linearised import Rehearsed, Tell, one_shape_each, rehearsed
 from droid_jax.rehearsal.plan import (
     HiddenCase,
     RehearsalPlan,
@@ -41,16 +41,6 @@ from droid_jax.rehearsal.plan import (
     robot_trace,
 )
 from droid_jax.rehearsal.power import smallest_sizes
-
-AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
-ROUGHLY = 5  # iterations of a base fit whose residual is taken for noise
-FINE = (8, 32)  # parts of a time step
-Tell = Callable[[str], None]
-
-
-def hidden_directions(model: LinearModel) -> list[int]:
-    """Of each coefficient at each place one direction (`one_shape_each`)."""
-    return one_shape_each(model.directions)
 
 
 def parameter_identifiability(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
@@ -75,7 +65,7 @@ def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaus
 def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalConfig) -> list[dict[str, Any]]:
     """Of each coefficient at each place: the smallest size that is found, and what it is taken for."""
     model, space = found.model.of(found.compared), found.case.full_space
-    wanted = hidden_directions(model)
+    wanted = one_shape_each(model.directions)
     out = []
     for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config.selection), strict=True):
         direction, p = model.directions[k], space[model.directions[k].coefficient]
@@ -91,7 +81,7 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
                 "limit": size.limit,
                 "limits": dict(size.limits),
                 "minimum": float(model.minimum[k]),
-                "bound": float(model.room[k]),
+                "bound": float(model.largest[k]),
                 "noncentrality": size.noncentrality,
                 "taken_for": [
                     {"effect": r.key.effect, "location": r.key.location, "share": r.share, "below": r.apart}
@@ -149,7 +139,7 @@ def law_checks(
     asked = [i for i, size in enumerate(sizes) if np.isfinite(size)]
     if not found.model.repeated or not asked:
         return out
-    train, wanted, model = found.case.train, hidden_directions(found.model), found.model.of(found.compared)
+    train, wanted, model = found.case.train, one_shape_each(found.model.directions), found.model.of(found.compared)
     seen = np.isin(found.model.train.channel, found.compared)
 
     def check(i: int, difference: np.ndarray, law: str) -> None:
@@ -217,7 +207,7 @@ def improvements(
     faster: Rehearsed | None = None,
 ) -> list[dict[str, Any]]:
     """What more repeats, another channel or another motion would change, the most helpful first."""
-    model, every = found.model.of(found.compared), hidden_directions(found.model)
+    model, every = found.model.of(found.compared), one_shape_each(found.model.directions)
     known, wanted = zip(*_one_each(known, every), strict=True)
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
