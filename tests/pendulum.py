@@ -44,6 +44,18 @@ def write_pendulum(folder: Path) -> tuple[str, ...]:
     return ("--scene", str(folder / "pendulum.xml"), "--parameters", str(folder / "parameters.json"))
 
 
+def ramped(goal: np.ndarray, steepest: float, step: float = 1e-4) -> np.ndarray:
+    """[T] a place that follows a goal [T] from rest, accelerates by at most so much and brakes in time."""
+    place, speed, out = goal[0], 0.0, []
+    for aim in goal:
+        way = aim - place
+        wanted = np.sign(way) * min(abs(way) / step, np.sqrt(2 * steepest * abs(way)))
+        speed += min(max(wanted - speed, -steepest * step), steepest * step)
+        place += step * speed
+        out.append(place)
+    return np.array(out)
+
+
 def swung(
     name: str,
     kp: float,
@@ -52,16 +64,24 @@ def swung(
     noise: float = 1e-4,
     repeats: int = 1,
     friction: float = 0.0,
+    command: np.ndarray | None = None,
+    steepest: float = np.inf,
 ) -> Recording:
-    """What the true pendulum does at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz]."""
+    """What the true pendulum does at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz].
+
+    command: [T] at RATE, in place of the sine.  steepest: rad/s^2, by which the servo's own goal accelerates at most.
+    """
     model = mujoco.MjModel.from_xml_string(MJCF.format(**TRUE, kp=kp))
     model.opt.timestep = 1e-4
     model.dof_frictionloss[:], model.dof_solimp[:, :2] = friction, 0.9999  # N m, that holds
     data = mujoco.MjData(model)
-    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    time = np.arange(0.0, SECONDS, 1.0 / RATE) if command is None else np.arange(len(command)) / RATE
     fine = np.arange(round(time[-1] / 1e-4) + 1) * 1e-4
-    command = 0.8 * np.sin(2 * np.pi * frequency * time) ** 2 * np.sign(np.sin(2 * np.pi * frequency * time))
+    if command is None:
+        command = 0.8 * np.sin(2 * np.pi * frequency * time) ** 2 * np.sign(np.sin(2 * np.pi * frequency * time))
     control = np.interp(fine, time, command)
+    if np.isfinite(steepest):
+        control = ramped(control, steepest)
     traces = {"position": [], "velocity": [], "torque": []}
     every = round(1.0 / RATE / 1e-4)
     for step, ctrl in enumerate(control):

@@ -100,10 +100,14 @@ class Cost:
         """The same replays, compared in another way: by comparisons of the same recordings."""
         return assemble(self.scene, self.space, comparisons, self._replays, self.drives)
 
-    def first(self) -> Cost:
-        """The cost of the first recording alone, on the same compiled functions."""
+    def alone(self, number: int) -> Cost:
+        """The cost of one of the recordings, on the same compiled functions."""
         each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
-        return replace(self, **{name: of_recordings[:1] for name, of_recordings in each.items()})
+        return replace(self, **{name: (of_recordings[number],) for name, of_recordings in each.items()})
+
+    def first(self) -> Cost:
+        """The cost of the first recording alone."""
+        return self.alone(0)
 
     def restated(self, values: np.ndarray) -> Cost:
         """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""

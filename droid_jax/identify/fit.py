@@ -4,7 +4,7 @@ every restart; and where the refinement begins from there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -211,16 +211,33 @@ class CmaState:
         self.records.setdefault("seconds", [])
 
 
-def starts(full: Space, space: Space, found: Fit) -> np.ndarray:
-    """[2 or 3, F] where the refinement begins: the search's best, the initial means, and these with a firm grip, where
-    the space has the friction of one.
+def starts(full: Space, space: Space, found: Fit, effects: Sequence[str] = ()) -> np.ndarray:
+    """[S, F] where the refinement begins: the search's best, the initial means, these with a firm grip where the space
+    has the friction of one, and the search's best with effects that do not act in it (`with_effects`).
 
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
     searched = full.embed(space, found.best[None])[0]
     pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
     firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
-    return np.stack([searched, full.mean, *([full.values(firm)] if firm else [])])
+    return np.stack(
+        [searched, full.mean, *([full.values(firm)] if firm else []), *with_effects(full, searched, effects)]
+    )
+
+
+def with_effects(space: Space, values: np.ndarray, effects: Sequence[str]) -> list[np.ndarray]:
+    """`values` [F] with the effects that stand neutral on a bound a prior deviation off it; nothing where none does.
+
+    A limit that acts and one that does not are different basins: where it is out of reach, no slope tells of it.
+
+    effects: names of their parameters.
+    """
+    acting = values.copy()
+    for p in map(space.__getitem__, effects):
+        at, way = space.index(p.name), (p.mean == p.low) - (p.mean == p.high)
+        if way and bound_of(p, float(values[at])) == ("lower" if way > 0 else "upper"):
+            acting[at] = np.clip(p.mean + way * p.std, p.low, p.high)
+    return [] if np.array_equal(acting, values) else [acting]
 
 
 def grip_hypotheses(space: Space) -> list[dict[str, float]]:

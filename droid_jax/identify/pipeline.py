@@ -17,7 +17,7 @@ from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
-from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts
+from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts, with_effects
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.holdout import WORTH, HeldoutDistance, beginning, heldout_distances, split_repeats
 from droid_jax.identify.identifiability import (
@@ -143,6 +143,7 @@ class Identified:
 
 Progress = Callable[[str, Any], None]
 FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
+SORTING = 6  # iterations that tell whether an effect acts
 FEWEST = 16  # samples of a Gaussian that show its spread
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
@@ -308,8 +309,9 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     refined = None
     if config.refine is not None:
         settings = config.refine if problem.engine.engine == "mjx" else replace(config.refine, **FEW)
-        begin = starts(full, space, found)
-        base, refined = _refined(base, problem.early, begin, settings, lambda p: report("refine", p))
+        asked = [p.name for e in problem.effects for p in e.parameters if p.name in full.names]
+        begin = starts(full, space, found, asked)
+        base, refined = _refined(base, problem.early, begin, asked, settings, lambda p: report("refine", p))
     best = found.best if refined is None else refined.best
     judging = config.identifiability
     full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
@@ -385,29 +387,39 @@ def _check_start(cost: Cost, space: Space) -> None:
 
 
 def _refined(
-    base: Cost, early: Cost, begin: np.ndarray, config: RefineConfig, report: Callable[[Any], None]
+    base: Cost,
+    early: Cost,
+    begin: np.ndarray,
+    effects: Sequence[str],
+    config: RefineConfig,
+    report: Callable[[Any], None],
 ) -> tuple[Cost, Refined]:
     """The refinement from starts [S, F], and the cost it ended on; early: of the recordings' beginnings, or the same.
 
-    The noise of a single repeat is not known: it is stated twice, from what the search and then from
-    what a first refinement leaves unexplained.
+    effects: names of their parameters.  The beginning of a chirp is slow and does not show what limits its end, so that
+    where some do not act, a few iterations on the whole of the recording that is fitted worst tell whether they would.
+
+    The noise of a single repeat is not known: it is stated from what the search, a first refinement and these
+    iterations leave unexplained.
     """
 
-    def run(cost: Cost, rough: Cost, begin: np.ndarray, config: RefineConfig = config) -> Refined:
-        hypotheses = grip_hypotheses(cost.space)
-        return refine(
-            cost.whitened, cost.space, begin, config, first=rough.whitened, hypotheses=hypotheses, progress=report
-        )
+    def run(cost: Cost, rough: Cost | None, begin: np.ndarray, config: RefineConfig = config) -> Refined:
+        hypotheses, first = grip_hypotheses(cost.space), None if rough is None else rough.whitened
+        return refine(cost.whitened, cost.space, begin, config, first=first, hypotheses=hypotheses, progress=report)
 
     whole = early is base
     if all(c.repeats > 1 for c in base.comparisons):
         return base, run(base, base.first() if whole else early, begin)
     early = early.restated(begin[0])
     first = run(early, early.first(), begin)
-    base = base.restated(first.best)
+    base, count = base.restated(first.best), first.evaluations
     settled = replace(config, basin_hops=0)  # the first one has looked for other basins
-    last = run(base, base.first() if whole else early.restated(first.best), first.best, settled)
-    return base, replace(last, evaluations=first.evaluations + last.evaluations)
+    if acting := with_effects(base.space, first.best, effects):
+        worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
+        first = run(worst, None, np.stack([first.best, *acting]), replace(settled, iterations=SORTING, spreads=0))
+        base, count = base.restated(first.best), count + first.evaluations
+    last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)
+    return base, replace(last, evaluations=count + last.evaluations)
 
 
 def _fingerprint(

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +29,7 @@ from droid_jax.identify.pipeline import Identified, IdentifyConfig, cost_samples
 from droid_jax.identify.results import traces, write_run
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel
 from droid_jax.report.identify_folder import FitFile
@@ -187,6 +189,22 @@ def test_the_refinement_also_begins_at_a_firm_grip_and_asks_which_fingers_slip()
     rest = space.select([n for n in space.names if n not in pads])
     searched.best = rest.mean
     assert len(starts(rest, rest, searched)) == 2 and grip_hypotheses(rest) == []
+
+
+def test_a_limit_that_acts_is_found_though_no_slope_at_zero_tells_of_it():
+    limit = Parameter("limit", "s^2/rad", 0.0, 0.02, 0.0, 1.0)
+    short, pull = replace(limit, name="short", mean=1.0), replace(limit, name="pull", low=-1.0)
+    space = Space((replace(limit, name="damping", mean=0.5), limit, short, pull))
+    searched: Any = SimpleNamespace(best=np.array([0.3, 0.0, 1.0, 0.1]))
+    begin = starts(space, space, searched, ["limit", "short", "pull"])
+    np.testing.assert_allclose(begin, [searched.best, space.mean, [0.3, 0.02, 0.98, 0.1]])
+
+    def residuals(rows: np.ndarray) -> np.ndarray:  # below 0.01 the limit is out of reach; its truth is 0.03
+        return np.stack([100 * (np.maximum(rows[:, 1], 0.01) - 0.03), rows[:, 0] - 0.3, rows[:, 3] - 0.1], axis=1) * 100
+
+    settings = RefineConfig(basin_hops=0)
+    assert refine(residuals, space, begin[:2], settings).best[1] == 0.0
+    assert refine(residuals, space, begin, settings).best[1] == pytest.approx(0.03, rel=0.01)
 
 
 def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path: Path):

@@ -8,12 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pendulum import PARAMETERS, START, TRUE, pendulum, swung, write_pendulum
+from pendulum import PARAMETERS, RATE, START, TRUE, pendulum, swung, write_pendulum
 
 from droid_jax.cost.channels import in_noise_units
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
-from droid_jax.identify.pipeline import IdentifyConfig, prepare
+from droid_jax.identify.multistart import RefineConfig
+from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters, prepare
+from droid_jax.identify.search import CmaConfig
+from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.recordings.formats import save_recording
 from droid_jax.run import main
@@ -117,6 +120,23 @@ def test_several_channels_count_in_units_of_their_noise(logs: SimpleNamespace):
     (start,) = alone.comparisons
     left = alone.smoothed(space.mean[None])[0][0] - start.channel("torque").noise.mean
     assert in_noise_units(alone, space.mean)["torque"] == pytest.approx(1 / np.sqrt(np.mean(left**2)), rel=1e-3)
+
+
+def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
+    """The search and the first refinement see the slow beginning, where the servo's own limit is out of reach."""
+    write_pendulum(tmp_path)
+    scene, clock = pendulum(), np.arange(0.0, 4.0, 1 / RATE)
+    waves = (
+        size * np.sin(np.pi * f * clock) * np.abs(np.sin(np.pi * f * clock)) for size, f in ((0.8, 0.5), (0.4, 5.0))
+    )
+    log = swung("chirp", START["kp"], 0.0, command=np.concatenate([*waves]), steepest=16.0)
+    effects = library(scene, ["profile_acceleration"])
+    space = load_parameters(tmp_path / "parameters.json", scene) + effect_space(effects)
+    search = CmaConfig(generations=1, population=4, parents=None)
+    still = RefineConfig(basin_hops=0)  # a hop may come upon it by chance
+    config = IdentifyConfig(beginning=3.0, search=search, refine=still, samples=0, checks=False)
+    found = identify_parameters(scene, space, [log], config=config, effects=effects)
+    assert found.best == pytest.approx([*TRUE.values(), 1 / 16.0], rel=0.05)
 
 
 def test_the_tests_pendulum_is_another_than_the_scenes():
