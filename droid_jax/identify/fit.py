@@ -213,7 +213,7 @@ class CmaState:
 
 def starts(full: Space, space: Space, found: Fit, effects: Sequence[str] = ()) -> np.ndarray:
     """[S, F] where the refinement begins: the search's best, the initial means, these with a firm grip where the space
-    has the friction of one, and the search's best with effects that do not act in it (`with_effects`).
+    has the friction of one, and the search's best with effects that do not act in it (`with_acting`).
 
     A grip that slips and one that never does are different basins, and neither start finds the other's.
     """
@@ -221,11 +221,11 @@ def starts(full: Space, space: Space, found: Fit, effects: Sequence[str] = ()) -
     pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
     firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
     return np.stack(
-        [searched, full.mean, *([full.values(firm)] if firm else []), *with_effects(full, searched, effects)]
+        [searched, full.mean, *([full.values(firm)] if firm else []), *with_acting(full, searched, effects)]
     )
 
 
-def with_effects(space: Space, values: np.ndarray, effects: Sequence[str]) -> list[np.ndarray]:
+def with_acting(space: Space, values: np.ndarray, effects: Sequence[str]) -> list[np.ndarray]:
     """`values` [F] with the effects that stand neutral on a bound a prior deviation off it; nothing where none does.
 
     A limit that acts and one that does not are different basins: where it is out of reach, no slope tells of it.

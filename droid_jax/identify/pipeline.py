@@ -17,7 +17,7 @@ from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
-from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts, with_effects
+from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts, with_acting
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
 from droid_jax.identify.holdout import WORTH, HeldoutDistance, beginning, heldout_distances, split_repeats
 from droid_jax.identify.identifiability import (
@@ -414,7 +414,7 @@ def _refined(
     first = run(early, early.first(), begin)
     base, count = base.restated(first.best), first.evaluations
     settled = replace(config, basin_hops=0)  # the first one has looked for other basins
-    if acting := with_effects(base.space, first.best, effects):
+    if acting := with_acting(base.space, first.best, effects):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
         first = run(worst, None, np.stack([first.best, *acting]), replace(settled, iterations=SORTING, spreads=0))
         base, count = base.restated(first.best), count + first.evaluations

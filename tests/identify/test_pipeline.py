@@ -197,7 +197,7 @@ def test_a_limit_that_acts_is_found_though_no_slope_at_zero_tells_of_it():
     space = Space((replace(limit, name="damping", mean=0.5), limit, short, pull))
     searched: Any = SimpleNamespace(best=np.array([0.3, 0.0, 1.0, 0.1]))
     begin = starts(space, space, searched, ["limit", "short", "pull"])
-    np.testing.assert_allclose(begin, [searched.best, space.mean, [0.3, 0.02, 0.98, 0.1]])
+    np.testing.assert_allclose(begin, np.stack([searched.best, space.mean, [0.3, 0.02, 0.98, 0.1]]))
 
     def residuals(rows: np.ndarray) -> np.ndarray:  # below 0.01 the limit is out of reach; its truth is 0.03
         return np.stack([100 * (np.maximum(rows[:, 1], 0.01) - 0.03), rows[:, 0] - 0.3, rows[:, 3] - 0.1], axis=1) * 100
