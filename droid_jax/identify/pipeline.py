@@ -143,7 +143,7 @@ class Identified:
 
 Progress = Callable[[str, Any], None]
 FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
-SORTING = 6  # iterations that tell whether an effect acts
+SORTING = 4  # iterations that tell whether an effect acts
 FEWEST = 16  # samples of a Gaussian that show its spread
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
