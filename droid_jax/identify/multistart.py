@@ -43,6 +43,8 @@ class RefineConfig(LevenbergMarquardtConfig):
     tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this,
     excess_tolerance: or by less than this share of what it is above that of noise alone: a model that misses something
       may be far from any fit.
+    patience: iterations in a row that do not pay before it stops; after one that found nothing slopes are taken over
+      another width.
     coarse_tolerance: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
     target_objective: an objective to reach: stop where it is further off than
     give_up: iterations like the last.
@@ -65,6 +67,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     iterations: int = 30
     tolerance: float = 0.5
     excess_tolerance: float = 2e-3
+    patience: int = 1
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
     give_up: float = 30.0
@@ -99,6 +102,7 @@ class RefineConfig(LevenbergMarquardtConfig):
             pruning_ratio=several(partial(arguments.number, least=1)),
             misfit_threshold=partial(arguments.number, least=0),
             hold_iterations=partial(whole, least=0),
+            patience=partial(whole, least=1),
             basin_hops=partial(whole, least=0),
             followed=partial(whole, least=1),
             basin_hop_generations=partial(whole, least=1),
@@ -248,13 +252,15 @@ class _Descent(DampedProblem):
         rough: a share of the objective that is not worth an iteration either.
         """
         ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
-        keep = self.config.pruning_ratio
+        keep, idle = self.config.pruning_ratio, 0
         for number in range(self.config.iterations - self.iterations):
             state, gain = self.step(state)
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
-            if gain[leader] <= max(self.least(state), rough * state.objective[leader]):
+            paid = gain[leader] > max(self.least(state), rough * state.objective[leader])
+            idle = 0 if paid else idle + 1
+            if idle == (1 if rough else self.config.patience):
                 break
             self.given_up = bool(
                 self.config.give_up * gain[leader] < state.objective[leader] - self.config.target_objective

@@ -54,6 +54,10 @@ class IdentifyConfig:
         refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
         beginning: s of long recordings that the search and the first refinement see, and more until every joint has
             moved through half of its range; the last refinement sees all.
+        sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`).
+        stale: share of a single repeat's stated noise, in squares; where the refinement leaves less, the noise is stated
+            once more and the refinement goes on,
+        restatements: so many times at most.
         samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
         sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
         seed: of those samples (the search has its own).
@@ -76,6 +80,9 @@ class IdentifyConfig:
     search: CmaConfig = field(default_factory=CmaConfig)
     refine: RefineConfig | None = field(default_factory=RefineConfig)
     beginning: float = 20.0
+    sorting: int = 4
+    stale: float = 0.7
+    restatements: int = 2
     samples: int = 200
     sample_steps: int = 5_000_000
     seed: int = 0
@@ -93,6 +100,8 @@ class IdentifyConfig:
             search=partial(instance, kind=CmaConfig),
             refine=optional(partial(instance, kind=RefineConfig)),
             beginning=partial(number, above=0, infinite=True),
+            stale=partial(number, least=0, most=1),
+            **dict.fromkeys(("sorting", "restatements"), partial(whole, least=0)),
             samples=partial(whole, least=0),
             sample_steps=partial(whole, least=1),
             seed=partial(whole, least=0),
@@ -142,8 +151,8 @@ class Identified:
 
 
 Progress = Callable[[str, Any], None]
-FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,)}  # trials where no block is filled up with copies
-SORTING = 4  # iterations that tell whether an effect acts
+# Where no block of trials is filled up with copies and an iteration costs little.
+FEW = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,), "patience": 2}
 FEWEST = 16  # samples of a Gaussian that show its spread
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
@@ -311,7 +320,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         settings = config.refine if problem.engine.engine == "mjx" else replace(config.refine, **FEW)
         asked = [p.name for e in problem.effects for p in e.parameters if p.name in full.names]
         begin = starts(full, space, found, asked)
-        base, refined = _refined(base, problem.early, begin, asked, settings, lambda p: report("refine", p))
+        base, refined = _refined(base, problem.early, begin, asked, config, settings, lambda p: report("refine", p))
     best = found.best if refined is None else refined.best
     judging = config.identifiability
     full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
@@ -391,7 +400,8 @@ def _refined(
     early: Cost,
     begin: np.ndarray,
     effects: Sequence[str],
-    config: RefineConfig,
+    config: IdentifyConfig,
+    settings: RefineConfig,
     report: Callable[[Any], None],
 ) -> tuple[Cost, Refined]:
     """The refinement from starts [S, F], and the cost it ended on; early: of the recordings' beginnings, or the same.
@@ -400,12 +410,12 @@ def _refined(
     where some do not act, a few iterations on the whole of the recording that is fitted worst tell whether they would.
 
     The noise of a single repeat is not known: it is stated from what the search, a first refinement and these
-    iterations leave unexplained.
+    iterations leave unexplained, and once more where the last one leaves much less of a recording than was stated.
     """
 
-    def run(cost: Cost, rough: Cost | None, begin: np.ndarray, config: RefineConfig = config) -> Refined:
+    def run(cost: Cost, rough: Cost | None, begin: np.ndarray, settings: RefineConfig = settings) -> Refined:
         hypotheses, first = grip_hypotheses(cost.space), None if rough is None else rough.whitened
-        return refine(cost.whitened, cost.space, begin, config, first=first, hypotheses=hypotheses, progress=report)
+        return refine(cost.whitened, cost.space, begin, settings, first=first, hypotheses=hypotheses, progress=report)
 
     whole = early is base
     if all(c.repeats > 1 for c in base.comparisons):
@@ -413,13 +423,25 @@ def _refined(
     early = early.restated(begin[0])
     first = run(early, early.first(), begin)
     base, count = base.restated(first.best), first.evaluations
-    settled = replace(config, basin_hops=0)  # the first one has looked for other basins
+    settled = replace(settings, basin_hops=0)  # the first one has looked for other basins
     if acting := with_acting(base.space, first.best, effects):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
-        first = run(worst, None, np.stack([first.best, *acting]), replace(settled, iterations=SORTING, spreads=0))
+        short = replace(settled, iterations=config.sorting, spreads=0)
+        first = run(worst, None, np.stack([first.best, *acting]), short)
         base, count = base.restated(first.best), count + first.evaluations
     last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)
+    for _ in range(config.restatements):
+        if _least_share(base, last.best) > config.stale:
+            break
+        base, count = base.restated(last.best), count + last.evaluations
+        last = run(base, None, last.best, settled)
     return base, replace(last, evaluations=count + last.evaluations)
+
+
+def _least_share(cost: Cost, values: np.ndarray) -> float:
+    """Least mean square, over recordings of one repeat, of what `values` [F] leave in units of the stated noise."""
+    alone = [cost.alone(k) for k, c in enumerate(cost.comparisons) if c.repeats == 1]
+    return min(float(np.mean(one.whitened(values[None]) ** 2)) for one in alone)
 
 
 def _fingerprint(
