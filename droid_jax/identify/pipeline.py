@@ -55,7 +55,7 @@ class IdentifyConfig:
         beginning: s of long recordings that the search and the first refinement see, and more until every joint has
             moved through half of its range; the last refinement sees all.
         sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`).
-        stale: share of a single repeat's stated noise, in squares; where the refinement leaves less, the noise is stated
+        stale: share of a single repeat's stated noise, in squares; where a refinement leaves less, noise is stated
             once more and the refinement goes on,
         restatements: so many times at most.
         samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
