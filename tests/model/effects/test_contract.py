@@ -135,6 +135,11 @@ def trace(scene: Scene) -> Rollout:
     return Rollout(time, torque, position, velocity, position[:, 0], jnp.zeros((11, 0), bool), jnp.array(True))
 
 
+# On the door some functions and physics compile for ten seconds each.
+OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", marks=pytest.mark.slow)], indirect=True)
+
+
+@OF_BOTH
 def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
     """To the last digit, with the means in theta and with nothing there."""
     thetas = ({p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}, {})
@@ -218,10 +223,6 @@ def physics_of(scene: Scene, name: str) -> Callable[[np.ndarray], Physics]:
 @pytest.fixture
 def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
     return physics_of(scene, effect.name)
-
-
-# The door's physics compile for ten seconds each.
-OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", marks=pytest.mark.slow)], indirect=True)
 
 
 @OF_BOTH
