@@ -22,12 +22,21 @@ from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.model.fields import body_mass, body_mass_scale, model_parameter
-from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible, possible_draws
+from droid_jax.model.inertia import (
+    TERMS,
+    WEIGHTS,
+    check_inertia,
+    free_inertias,
+    inertia_parameters,
+    inertia_possible,
+    inertial_fields,
+    possible_draws,
+    root_of,
+)
 from droid_jax.model.mjcf import fitted_files, fitted_mjcf
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, inertia_parameters, inertial_fields, root_of
 from droid_jax.model.scene import Scene, compile_scene
 
 XML = """<mujoco><option integrator="implicitfast"/><worldbody>
