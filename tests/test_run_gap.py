@@ -18,8 +18,7 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
-from droid_jax.discrepancy import case as cases
-from droid_jax.discrepancy import fitting, missing
+from droid_jax.discrepancy import fitting, log_case, missing
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Effect
@@ -381,7 +380,7 @@ def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, mon
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
     monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
-    monkeypatch.setattr(cases, "make_case", lambda *arguments, **roles: small().case)
+    monkeypatch.setattr(log_case, "make_case", lambda *arguments, **roles: small().case)
     monkeypatch.setattr(missing, "with_step_difference", lambda train, *_: train)
     monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
     monkeypatch.setattr(page, "write_report", lambda folder: folder / "report.html")

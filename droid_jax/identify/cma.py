@@ -122,7 +122,9 @@ def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
     evosax = CMA_ES(population, jnp.zeros(dims), fitness_shaping_fn=_ranked_weights)
 
     def init(seed: Any, x: Any, params: Any) -> Any:
-        return evosax.init(jax.random.key(seed), x, params)
+        state = evosax.init(jax.random.key(seed), x, params)
+        # Of the types that `tell` returns: evosax's weak ones would compile everything a second time.
+        return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), state)
 
     def ask(seed: Any, generation: Any, state: Any, params: Any, box: Any) -> tuple[Any, Any]:
         """One restart's rows [P, D]: per row, its first draw inside the box [2, D]."""

@@ -20,12 +20,11 @@ from droid_jax.files import APPLY_FIT, FITTED_JSON, MJLAB_TERMS
 from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.model.effect_interface import Effect
+from droid_jax.model.inertia import PSEUDO_INERTIA, TERMS, WEIGHTS, root_of
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.mjcf import FittedFiles, field_unit, fitted_files, is_angle, mjcf_attribute, native, unwritten
 from droid_jax.model.parameters import Parameter, Role, Space
 from droid_jax.model.physics import entries_written, make_c_model
-from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
-from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, root_of
 from droid_jax.model.scene import Scene
 from droid_jax.storage import write_bytes, write_text
 

@@ -21,9 +21,8 @@ import mujoco
 import numpy as np
 
 from droid_jax.model.actuators import drives_joint, has_servo_damping
+from droid_jax.model.inertia import PSEUDO_INERTIA, check_single_inertia, nominal_field
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
-from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
-from droid_jax.model.pseudo_inertia import check_single_inertia, nominal_field
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 _KIND = {

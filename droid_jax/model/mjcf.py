@@ -15,10 +15,10 @@ import numpy as np
 from droid_jax.arguments import instance, instances, numeric, shown
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import check_space
+from droid_jax.model.inertia import PSEUDO_INERTIA
 from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumber, WantedNumber, edit
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.pseudo_inertia import FIELD as PSEUDO_INERTIA
 from droid_jax.model.scene import Scene
 from droid_jax.model.visual_geoms import compiled, keep_inertia, look_geoms, weigh
 

@@ -34,7 +34,7 @@ With "each" it makes one for each element, "rotor_shoulder" and "rotor_elbow".
 
     {"inertia": "forearm", "std": 0.1}
 
-The whole inertia of a body, ten parameters that are a possible body at every value (model/pseudo_inertia.py).
+The whole inertia of a body, ten parameters that are a possible body at every value (model/inertia.py).
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ from droid_jax.model.fields import (
     shared,
     time_offset,
 )
+from droid_jax.model.inertia import check_single_inertia, inertia_parameters
 from droid_jax.model.joint_friction import TERMS, sensor_parameter
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
-from droid_jax.model.pseudo_inertia import check_single_inertia, inertia_parameters
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 

@@ -23,9 +23,9 @@ from droid_jax.door.space import JOINT_DAMPING, door_nuisances, door_space, torq
 from droid_jax.door.space import truth as table_i
 from droid_jax.files import SYNTHETIC_SOURCE as SOURCE
 from droid_jax.model.fields import time_offset
+from droid_jax.model.inertia import nominal_field
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.pseudo_inertia import nominal_field
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.clocks import interpolate

@@ -39,7 +39,7 @@ THREE = [replace(elbow_log(COULOMB, 7.0, 8, pace), name=f"pace {pace:g}") for pa
 @pytest.mark.parametrize(
     ("recordings", "judged", "searched"),
     [
-        (THREE, ["train", "validation", "test"], True),
+        pytest.param(THREE, ["train", "validation", "test"], True, marks=pytest.mark.slow),
         ([elbow_log(COULOMB, 7.0, repeats=16)], ["train", "validation"], True),
         ([elbow_log(COULOMB)], ["train", "validation", "test"], False),
     ],

@@ -219,14 +219,22 @@ def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
     assert np.sqrt(np.mean(again.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
 
 
+def of_two_lengths() -> list[Recording]:
+    first, second = swung("a", 1.0, 0.7), swung("soft", 0.6, 1.1)
+    return [first, second.window(0.0, 0.9 * second.duration)]
+
+
 def test_motions_of_about_one_length_are_replayed_together(space: Space):
-    """In one batch, and each as it is alone; one that is much shorter is no part of it."""
+    """In one batch; one that is much shorter is no part of it."""
     assert shared_steps([400, 100, 380, 390]) == [400, 100, 400, 400] and shared_steps([7]) == [7]
-    logs = [swung("a", 1.0, 0.7), swung("soft", 0.6, 1.1)]
-    logs[1] = logs[1].window(0.0, 0.9 * logs[1].duration)
-    rows = np.stack([space.mean, space.values(TRUE)])
-    both = whole_log(space, logs)
+    both = whole_log(space, of_two_lengths())
     assert both.pieces[0].program is both.pieces[1].program
+
+
+@pytest.mark.slow
+def test_a_motion_that_is_replayed_with_another_is_as_it_is_alone(space: Space):
+    logs = of_two_lengths()
+    rows, both = np.stack([space.mean, space.values(TRUE)]), whole_log(space, logs)
     alone = [whole_log(space, [log]).simulated(rows) for log in logs]
     np.testing.assert_allclose(both.simulated(rows), np.concatenate(alone, axis=1), atol=1e-5)
 

@@ -130,6 +130,7 @@ def test_policies_that_differ_widen_the_interval():
     assert wide == [0.0, 1.0]
 
 
+@pytest.mark.slow
 def test_intervals_of_five_policies_hold_the_truth_as_often_as_they_say():
     """Policies of rates between 0.4 and 1, forty trials each; plain quantiles hold the truth less often than that."""
     rng, held = np.random.default_rng(0), 0

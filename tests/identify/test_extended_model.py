@@ -75,6 +75,7 @@ def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
     assert dict(zip(again.space.names, again.values, strict=True)) == {"inertia": 50.0, "hinge_preload": 0.7}
 
 
+@pytest.mark.slow
 def test_the_cost_is_that_of_the_search(found: Small, saved: Path):
     """Compiled with the one effect alone instead of the whole library: 3e-4 N m is what that may change."""
     scene, _ = small_scene()

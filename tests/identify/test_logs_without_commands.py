@@ -1,4 +1,7 @@
-"""Identification from a log without commands, end to end: a carriage with a known equation of motion."""
+"""Identification from a log without commands, end to end: a carriage with a known equation of motion.
+
+Slow throughout; test_pipeline.py has a log of this kind too.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ XML = """<mujoco><option gravity="0 0 0"/><worldbody><body name="carriage">
   <joint name="slide" type="slide" axis="1 0 0" damping="10" frictionloss="1e-6"/><geom size=".1" mass="8"/></body>
 </worldbody></mujoco>"""
 MASS, DAMPING, COULOMB = 5.0, 20.0, 3.0  # kg, N s/m, N
+pytestmark = pytest.mark.slow
 TIME = np.arange(0, 12.0, 2e-3)
 
 
@@ -71,7 +75,6 @@ def found(scene: Scene, space: Space) -> Identified:
     return identify_parameters(scene, space, [log(1)], config=config)
 
 
-@pytest.mark.slow
 def test_mass_and_friction_come_back(found: Identified):
     assert found.best == pytest.approx([MASS, DAMPING, COULOMB], rel=0.02)
     low, high = found.gaussian.interval(0.9)
@@ -97,7 +100,6 @@ def test_the_noise_of_one_repeat_is_what_the_fit_leaves(found: Identified):
     assert 0.02 < np.mean(found.refined.residual**2) < 1.5
 
 
-@pytest.mark.slow
 def test_repeats_are_split_by_number(scene: Scene, space: Space):
     recording = log(4)
     fitted, held, rows = split_repeats(recording, 0.3)
@@ -108,7 +110,6 @@ def test_repeats_are_split_by_number(scene: Scene, space: Space):
     assert near < 0.3 < far
 
 
-@pytest.mark.slow
 def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
     first, second = log(3), another()
     both = make_cost(scene, space, [first, second])
@@ -123,7 +124,6 @@ def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
     assert both.first().whitened(rows).shape == each[0].whitened(rows).shape
 
 
-@pytest.mark.slow
 def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
     config = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), samples=4)
     found = identify_parameters(scene, space, [log(3), another()], config=config)
@@ -135,7 +135,6 @@ def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
         assert (gap.before, gap.after) == (pytest.approx(before, rel=1e-5), pytest.approx(after, rel=1e-3))
 
 
-@pytest.mark.slow
 def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space: Space):
     fitted, held, _ = split_repeats(log(4), 0.3)
     cost = make_cost(scene, space, [fitted])
@@ -152,14 +151,12 @@ def test_another_motion_on_the_same_clock_compiles_no_replay(scene: Scene, space
     np.testing.assert_array_equal(cost.whitened(rows), first)
 
 
-@pytest.mark.slow
 def test_a_motion_on_another_clock_is_refused(scene: Scene, space: Space):
     cost = make_cost(scene, space, [log(1)])
     with pytest.raises(ValueError, match="other commands than 'log' had"):
         cost.against([log(1).window(0.0, 8.0)])
 
 
-@pytest.mark.slow
 def test_plain_c_gives_the_same_cost(scene: Scene, space: Space):
     rows = np.stack([space.mean, space.values({"slide_damping": 15.0, "coulomb[slide]": 2.0})])
     mjx, c = (make_cost(scene, space, [log(3)], engine=engine) for engine in ("mjx", "mujoco"))
@@ -167,7 +164,6 @@ def test_plain_c_gives_the_same_cost(scene: Scene, space: Space):
     np.testing.assert_allclose(c.whitened(rows), mjx.whitened(rows), rtol=1e-4, atol=0.02)
 
 
-@pytest.mark.slow
 def test_the_motion_filter_is_a_setting(scene: Scene, space: Space):
     slow, fast = (make_cost(scene, space, [log(1)], config=CompareConfig(motion_cutoff=c)) for c in (5.0, 30.0))
     assert slow.drives[0].timestep == pytest.approx(6 * fast.drives[0].timestep)

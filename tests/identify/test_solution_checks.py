@@ -107,7 +107,7 @@ def test_data_of_mj_step_have_no_error_of_its_step():
     assert check.discretisation is None and check.parity_rms is not None and check.parity_rms < 1e-3
 
 
-@pytest.mark.parametrize(("engine", "step"), [("mjx", 0.02), ("mujoco", 0.05)])
+@pytest.mark.parametrize(("engine", "step"), [pytest.param("mjx", 0.02, marks=pytest.mark.slow), ("mujoco", 0.05)])
 def test_an_interval_is_as_wide_as_the_time_step_makes_it(engine: Literal["mjx", "mujoco"], step: float):
     """The robot's step is 0.1 ms: the fit makes up for the scene's with another damping, and says so."""
     scene, recording, truth = hinge(step), recorded(), 0.9

@@ -201,7 +201,11 @@ KEPT = {
 }
 
 
-QUICK = ("joints", "equalities")  # the others are the same test, and compile as long; test_step.py has contacts
+# One program holds two; the others are the same test, and compile as long.  test_step.py has contacts.
+KEPT["joints and equalities"] = {
+    **KEPT["joints"], "more": KEPT["joints"]["more"] + KEPT["equalities"]["more"]
+}  # fmt: skip
+QUICK = ("joints and equalities",)
 
 
 @pytest.mark.parametrize("kept", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEPT])

@@ -10,6 +10,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -21,12 +22,21 @@ from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import prior
 from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.model.fields import body_mass, body_mass_scale, model_parameter
-from droid_jax.model.inertia import check_inertia, free_inertias, inertia_possible, possible_draws
+from droid_jax.model.inertia import (
+    TERMS,
+    WEIGHTS,
+    check_inertia,
+    free_inertias,
+    inertia_parameters,
+    inertia_possible,
+    inertial_fields,
+    possible_draws,
+    root_of,
+)
 from droid_jax.model.mjcf import fitted_files, fitted_mjcf
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics
-from droid_jax.model.pseudo_inertia import TERMS, WEIGHTS, inertia_parameters, inertial_fields, root_of
 from droid_jax.model.scene import Scene, compile_scene
 
 XML = """<mujoco><option integrator="implicitfast"/><worldbody>
@@ -192,7 +202,7 @@ def test_a_replay_has_the_inertia_of_an_mjcf_that_states_it(limb: Scene):
     for other in full[1:]:
         for one, two in zip(full[0], other, strict=True):
             np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-8)  # a text has six digits
-    physics = make_physics(limb, space, jnp.asarray(values, jnp.float32)).model
+    physics = jax.jit(lambda row: make_physics(limb, space, row).model)(jnp.asarray(values, jnp.float32))
     for body in (1, 2):
         assert_alike(of(physics, body), of(stated, body), 1e-5)
     np.testing.assert_allclose(physics.dof_invweight0, stated.dof_invweight0, rtol=1e-5)

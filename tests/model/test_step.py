@@ -298,7 +298,7 @@ def run_spinner(
     return np.asarray(position), np.asarray(velocity)
 
 
-@pytest.mark.parametrize("parity", [True, False])
+@pytest.mark.parametrize("parity", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_dry_friction_decelerates_by_its_own_torque(parity: bool):
     """I dv/dt = -0.5 N m until the joint stands: v = v0 - 5 t, from either side."""
     for sign in (1.0, -1.0):

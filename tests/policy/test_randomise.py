@@ -73,10 +73,12 @@ def test_every_row_is_its_draw(request: pytest.FixtureRequest, keys, of: str, jo
     """The door's physics compiles for half a minute, in both ways that are compared; the small scene's for seconds."""
     if of == "bench":
         scene, space = request.getfixturevalue("bench")
-        gaussian = prior(space)
+        gaussian = prior(space + effect_space(library(scene, ["latch"])))
     else:
         scene, gaussian = (request.getfixturevalue(name) for name in ("scene", "gaussian"))
     physics, batched = randomised(scene, gaussian)(Physics(scene.mjx, {}), keys)
+    if of == "bench":  # effects ride in theta
+        assert physics.theta["latch_torque"].shape == (ENVS,) and batched.theta["latch_torque"] == 0
     seen = np.asarray(physics.model.dof_damping)[:, scene.dof(joint)]
     assert len(np.unique(seen)) == ENVS
     low, high = gaussian.space[damping].low, gaussian.space[damping].high
@@ -128,14 +130,6 @@ def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, ga
     drawn = hinge("fitted")
     assert len(np.unique(drawn)) == ENVS and np.abs(np.log(drawn / middle)).max() < 0.5
     assert np.median(hinge("prior")) < 0.7 * middle
-
-
-def test_effects_ride_in_theta(bench, keys):
-    scene, base = bench
-    space = base + effect_space(library(scene, ["latch"]))
-    physics, batched = randomised(scene, prior(space))(Physics(scene.mjx, {}), keys)
-    assert physics.theta["latch_torque"].shape == (ENVS,)
-    assert batched.theta["latch_torque"] == 0
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_si
 from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import CmaConfig
+from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import Candidate
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import joint_damping
@@ -222,10 +223,16 @@ def hinge() -> tuple[Scene, Space]:
 
 
 @pytest.fixture(scope="module")
-def result(hinge) -> dict[str, Any]:
+def effects(hinge) -> tuple[Effect, ...]:
+    """The same for all: a program belongs to its effects."""
+    return library(hinge[0], EFFECTS)
+
+
+@pytest.fixture(scope="module")
+def result(hinge, effects: tuple[Effect, ...]) -> dict[str, Any]:
     scene, space = hinge
     recordings = [motion(), motion("validation", 1.0, 2.5)]
-    return quick_rehearsal(scene, space, library(scene, EFFECTS), recordings, PLAN, step_error=False)[1]
+    return quick_rehearsal(scene, space, effects, recordings, PLAN, step_error=False)[1]
 
 
 def entry(result: dict[str, Any], effect: str) -> dict[str, Any]:
@@ -261,11 +268,11 @@ def test_slopes_of_one_batch_are_those_of_two():
     assert one.objective == pytest.approx(two.objective)
 
 
-def test_plain_c_in_fine_steps_tells_the_step_error(hinge):
+def test_plain_c_in_fine_steps_tells_the_step_error(hinge, effects: tuple[Effect, ...]):
     """The same order as the search's own, of the compiled replay at a quarter of its step."""
     scene, space = hinge
     recordings = [motion(), motion("validation", 1.0)]
-    asked = (scene, space, library(scene, EFFECTS), recordings, PLAN, DiscrepancyConfig(), CONFIG)
+    asked = (scene, space, effects, recordings, PLAN, DiscrepancyConfig(), CONFIG)
     of = rehearsed(*asked, step_error=False)
     train, roles = of.case.train, of.roles
     known = fine_steps(train, of.base, of.case.base, roles["train"])

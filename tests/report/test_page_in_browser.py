@@ -90,10 +90,10 @@ def _console(stderr: str) -> list[str]:
 SIZES = pytest.mark.parametrize(
     ("size", "shown", "hidden"),
     [
-        ((1200, 900), "wide", "narrow"),
-        ((834, 1112), "wide", "narrow"),  # a tablet
+        pytest.param((1200, 900), "wide", "narrow", marks=pytest.mark.slow),
+        pytest.param((834, 1112), "wide", "narrow", marks=pytest.mark.slow),  # a tablet
         ((720, 900), "wide", "narrow"),
-        ((500, 900), "narrow", "wide"),
+        pytest.param((500, 900), "narrow", "wide", marks=pytest.mark.slow),
         ((375, 812), "narrow", "wide"),  # a phone
     ],
 )

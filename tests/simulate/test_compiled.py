@@ -56,17 +56,25 @@ def base(scene: Scene) -> tuple[Effect, list[float], np.ndarray]:
     return effect, traced, torque(made(scene, recording(), effect))
 
 
-def test_other_commands_starts_and_bounds_share_a_program(scene: Scene, base: tuple[Effect, list[float], np.ndarray]):
+def test_other_commands_starts_and_bounds_share_a_program(
+    scene: Scene, base: tuple[Effect, list[float], np.ndarray], monkeypatch: pytest.MonkeyPatch
+):
+    """And another effect has one of its own: here with no more room than the motion needs, which changes no replay."""
     effect, traced, first = base
     count, command = len(traced), motion()[1]
     slower = recording(name="slower", command=0.5 * command + 0.5 * command[0])
     other = torque(made(scene, slower, effect, high=5.0))
     assert count and len(traced) == count
     assert np.abs(other - first).max() > 0.1
-    alone = torque(made(arm(), slower, pull(0.0, [])))  # compiled for itself
+    monkeypatch.setattr(compiled, "SHORTEST", 1)
+    assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
+    own = list[float]()
+    alone = torque(made(scene, slower, pull(0.0, own)))
+    assert own and len(traced) == count
     np.testing.assert_array_equal(other, alone)
 
 
+@pytest.mark.slow
 def test_another_effect_does_not(scene: Scene, base: tuple[Effect, list[float], np.ndarray]):
     _, traced, first = base
     loaded = torque(made(scene, recording(), pull(1.0, traced)))
@@ -93,15 +101,6 @@ def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(
     short = recording(time=time, command=command, channels={"torque": seen})
     np.testing.assert_allclose(torque(made(scene, short, effect)), whole[: len(time)], atol=1e-4)
     assert len(traced) == count
-
-
-def test_the_room_of_a_program_changes_no_replay(
-    scene: Scene, base: tuple[Effect, list[float], np.ndarray], monkeypatch: pytest.MonkeyPatch
-):
-    _, _, roomy = base
-    monkeypatch.setattr(compiled, "SHORTEST", 1)
-    assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
-    np.testing.assert_array_equal(torque(made(scene, recording(), pull(0.0, []))), roomy)
 
 
 def summed(traced: list[int]) -> Any:

@@ -64,21 +64,10 @@ def in_c(scene: Scene, space: Space, drive: Drive, rows: np.ndarray) -> Rollout:
     return c_replay(scene, space, drive)(rows)
 
 
-def part(rollout: Rollout, rows: slice, steps: int) -> Rollout:
-    """Some rows [P] of a rollout, up to a step."""
-    arrays = {name: getattr(rollout, name)[rows] for name in Rollout.__dataclass_fields__}
-    return Rollout(**{name: a[:, :steps] if a.ndim > 1 else a for name, a in arrays.items()})
-
-
-@pytest.fixture(scope="module", params=[(slice(1, 5, 3), 1900), pytest.param((slice(6), 3851), marks=pytest.mark.slow)])
-def both(
-    request, scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout
-) -> tuple[Rollout, Rollout, int]:
-    """MJX and C: two doors until they have begun to open, and all of them to the end; and how many steps these are."""
-    chosen, steps = request.param
-    cut = replace(drive, command=drive.command[:steps])
-    in_mjx = replayed(scene, space, cut, rows[chosen], parity=True)
-    return in_mjx, part(in_c, chosen, steps), steps
+@pytest.fixture(scope="module")
+def both(scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout) -> tuple[Rollout, Rollout]:
+    """MJX and C.  The program compiles for half a minute: quick tests of the door in MJX are in test_door_env.py."""
+    return replayed(scene, space, drive, rows, parity=True), in_c
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -92,18 +81,19 @@ def test_the_doors_open(in_c: Rollout):
     assert in_c.contact[:, -1].all()
 
 
-def test_torques_are_those_of_the_c_engine(both: tuple[Rollout, Rollout, int]):
+@pytest.mark.slow
+def test_torques_are_those_of_the_c_engine(both: tuple[Rollout, Rollout]):
     """Through grasp and opening: float32 against float64 (0.0015 N m over 7.7 s when this was written)."""
-    in_mjx, in_c, steps = both
-    assert in_mjx.torque.shape[1] == steps and in_c.contact[:, -1].all()
-    assert (np.rad2deg(in_c.object_angle[:, -1]) > 3.0).all()
+    in_mjx, in_c = both
+    assert in_mjx.torque.shape == in_c.torque.shape
     off = rms(in_mjx.torque, in_c.torque)
     assert off.max() < 0.005, off.round(4)
     assert np.abs(in_c.torque).max() > 5.0
 
 
-def test_motion_and_contacts_are_those_of_the_c_engine(both: tuple[Rollout, Rollout, int]):
-    in_mjx, in_c, _ = both
+@pytest.mark.slow
+def test_motion_and_contacts_are_those_of_the_c_engine(both: tuple[Rollout, Rollout]):
+    in_mjx, in_c = both
     np.testing.assert_allclose(in_mjx.object_angle, in_c.object_angle, atol=1e-4)
     np.testing.assert_allclose(in_mjx.position, in_c.position, atol=1e-4)
     np.testing.assert_array_equal(in_mjx.contact, in_c.contact)

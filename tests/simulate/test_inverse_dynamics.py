@@ -126,10 +126,12 @@ def planar(*, gravcomp: bool = True, spring: str = "", more: str = "", joints: S
 
 
 def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
+    """With a torque sensor whose zero is off: effects of sensors are applied."""
     space = Space(torque_offsets(scene.joints))
-    given = motion(scene, side, gravity)
-    got = replayed(scene, space, space.mean, given)
-    np.testing.assert_allclose(got.torque, expected(scene.model, scene, given), atol=5e-5)
+    given, off = motion(scene, side, gravity), np.array([0.0, 0.3])
+    values = space.values({"torque_offset[b]": off[1]})
+    got = replayed(scene, space, values, given, torque_offset_effect(scene.joints))
+    np.testing.assert_allclose(got.torque - off, expected(scene.model, scene, given), atol=5e-5)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +180,9 @@ def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
         np.testing.assert_allclose(c.torque, mjx.torque, atol=5e-5)
         assert np.asarray(c.finite).all() and np.ptp(np.asarray(c.torque), axis=0).max() > 0.1
         paths = jax.tree.map(lambda a: jnp.stack([a, a]), motion_path(scene, follows))
-        np.testing.assert_allclose(other.torques(paths), one.torques(paths), atol=5e-5)
+        np.testing.assert_allclose(other.torques(paths), np.stack([mjx.torque[0]] * 2), atol=5e-5)  # at the means
+        if side is LINK:  # MJX compiles them anew
+            np.testing.assert_allclose(other.torques(paths), one.torques(paths), atol=5e-5)
 
 
 def test_plain_c_refuses_what_it_does_not_have():
@@ -222,16 +226,6 @@ def test_a_carrier_without_positions_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert prescribed(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
-
-
-def test_observation_effects_are_applied():
-    scene = planar()
-    space = Space(torque_offsets(scene.joints))
-    given = motion(scene, LINK, True)
-    values = space.values({"torque_offset[b]": 0.3})
-    shifted = replayed(scene, space, values, given, torque_offset_effect(scene.joints)).torque
-    offset = np.tile([0.0, 0.3], (40, 1))
-    np.testing.assert_allclose(shifted - expected(scene.model, scene, given), offset, atol=5e-5)
 
 
 @pytest.mark.parametrize("part", ["command", "servo"])

@@ -188,6 +188,7 @@ def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
     np.testing.assert_allclose(got.velocity[0, :-1], told, atol=1e-12)
 
 
+@pytest.mark.slow  # quick with effects: tests/model/effects/test_parity.py
 def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive):
     twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
     for channel in ("torque", "position", "velocity"):
@@ -295,6 +296,7 @@ def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float
     assert np.sqrt(np.mean((servo_torque(q, 0.0)[1:-1] - expected) ** 2)) > 0.3  # what the motor's side reads
 
 
+@pytest.mark.slow  # quick with effects: test_effects_enter_where_they_say
 def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, rollout: Rollout):
     heavy = replayed(TorqueConvention(TorqueSide.MOTOR, True))
     np.testing.assert_array_equal(heavy.position[0], rollout.position[0])
@@ -410,11 +412,12 @@ def test_parity_with_a_velocity_gain_is_mj_step():
 # ----- effects
 
 
-def test_effects_enter_where_they_say(scene: Scene, drive: Drive, rollout: Rollout):
+def test_effects_enter_where_they_say(scene: Scene, rollout: Rollout):
     """A constant force, two command laws and an observation, each against what it must do.
 
-    The second law, a delay of 20 ms, sees what the first makes of the command.
+    The second law, a delay of 20 ms, sees what the first makes of the command.  The torque holds the weight.
     """
+    drive = make_drive(scene, recording(torque=TorqueConvention(TorqueSide.MOTOR, True)))
     seen = {}
 
     def force(theta, state):
@@ -428,7 +431,10 @@ def test_effects_enter_where_they_say(scene: Scene, drive: Drive, rollout: Rollo
     physics = make_physics(scene, SPACE, jnp.asarray(SPACE.mean, jnp.float32))
     replay = servo_replay(scene, drive, (kick, hold, late, double))
     got = jax.jit(replay, compiler_options=runtime.compiler_options())(physics)
-    torque, position = np.asarray(got.torque) / 2.0, np.asarray(got.position)
+    position = np.asarray(got.position, float)
+    weight = inverse(scene, position, 0 * position, 0 * position, armature=True, gravity=True)
+    torque = np.asarray(got.torque) / 2.0 - weight
+    assert np.abs(weight).max() > 1.0
     assert seen["shapes"] == ((2,), (2,), (2,))
     np.testing.assert_allclose(torque, 0.5 * (servo_torque(position, 0.02) + servo_torque(position, 0.03)), atol=2e-4)
     # at rest the servo gives way until kp dq = 6 N m

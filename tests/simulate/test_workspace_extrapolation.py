@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from small_gap import record, small_scene
 
-from droid_jax.door.demonstration import PLANS, demonstrate
+from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
+from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
 from droid_jax.simulate.replay import make_drive
@@ -35,16 +36,23 @@ def replayed(recording: Recording) -> Rollout:
 
 @functools.cache
 def plan(name: str) -> tuple[Recording, Rollout]:
-    demonstration = demonstrate(scene(), PLANS[name])
+    demonstration = load_recording(demonstration_path(name))
     return demonstration, replayed(demonstration)
+
+
+@functools.cache
+def further(name: str) -> Recording:
+    demonstration, before = plan(name)
+    longer = opened_further(scene(), demonstration, before)
+    assert longer is not None
+    return longer
 
 
 @pytest.mark.parametrize("name", ["A", pytest.param("C", marks=pytest.mark.slow)])
 def test_the_door_goes_a_third_further_and_comes_back(name: str):
     """C closes again afterwards: what follows the widest opening follows it still, later."""
     demonstration, before = plan(name)
-    longer = opened_further(scene(), demonstration, before)
-    assert longer is not None
+    longer = further(name)
     after = replayed(longer)
     assert after.object_angle.max() == pytest.approx(4 / 3 * before.object_angle.max(), abs=np.deg2rad(1.5))
     added = longer.duration - demonstration.duration
@@ -57,9 +65,7 @@ def test_the_door_goes_a_third_further_and_comes_back(name: str):
 
 
 def test_the_servo_is_not_asked_for_jerks():
-    demonstration, before = plan("A")
-    longer = opened_further(scene(), demonstration, before)
-    assert longer is not None
+    (demonstration, _), longer = plan("A"), further("A")
 
     def fastest(recording: Recording) -> np.ndarray:
         return np.abs(np.gradient(recording.command[:, :7], recording.time, axis=0)).max(axis=0)

@@ -76,10 +76,14 @@ def make_bench(scene: Scene, drive: Drive, effects: Sequence[Effect] | None = No
 
 
 def bare(bench: Bench, *, parity: bool = False) -> Rollout:
-    """The same scene and commands compiled without any effect, [T, ...]."""
+    """The same scene and commands compiled without any effect, [T, ...].
+
+    The model is the scene's own: writing every parameter of the library into it would compile as long again.
+    """
     replay = servo_replay(bench.scene, bench.drive, parity=parity)
-    run = over_population(lambda v: replay(make_physics(bench.scene, bench.space, v)))
-    return jax.tree.map(lambda array: array[0], run(bench.space.mean[None]))
+    outside = Space(tuple(p for p in bench.space.parameters if not p.writes))
+    run = over_population(lambda v: replay(make_physics(bench.scene, outside, v)))
+    return jax.tree.map(lambda array: array[0], run(outside.mean[None]))
 
 
 def typical(parameter: Parameter) -> float:

@@ -135,28 +135,35 @@ def trace(scene: Scene) -> Rollout:
     return Rollout(time, torque, position, velocity, position[:, 0], jnp.zeros((11, 0), bool), jnp.array(True))
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["means", "absent"])
-def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene, given: bool):
+# On the door some functions and physics compile for ten seconds each.
+OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", marks=pytest.mark.slow)], indirect=True)
+
+
+@OF_BOTH
+def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
     """To the last digit, with the means in theta and with nothing there."""
-    theta = {p.name: jnp.float32(p.mean) for p in effect.parameters if given and not p.writes}
-    force = jax.jit(effect.force) if effect.force else None
+    thetas = ({p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}, {})
+    # In one program: some compile for seconds.
+    forces = jax.jit(lambda state: [effect.force(theta, state) for theta in thetas]) if effect.force else None
     for state in moments(scene):
-        if force:
-            np.testing.assert_array_equal(force(theta, state), np.zeros(scene.model.nv))
-        if effect.frictionloss:
-            base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
-            np.testing.assert_array_equal(effect.frictionloss(theta, state, base), base)
-        if effect.servo:
-            ctrl = jnp.cos(jnp.arange(scene.model.nu, dtype=jnp.float32))
-            np.testing.assert_array_equal(effect.servo(theta, state, ctrl), ctrl)
-        if effect.profile:
-            given = jnp.sin(jnp.arange(3.0 * scene.model.nu)).reshape(3, -1)
-            np.testing.assert_array_equal(effect.profile(theta, given, 0.002), given)
-        if effect.command:
-            np.testing.assert_array_equal(effect.command(theta, state.time, jnp.sin), jnp.sin(state.time))
+        for force in forces(state) if forces else ():
+            np.testing.assert_array_equal(force, np.zeros(scene.model.nv))
+        for theta in thetas:
+            if effect.frictionloss:
+                base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
+                np.testing.assert_array_equal(effect.frictionloss(theta, state, base), base)
+            if effect.servo:
+                ctrl = jnp.cos(jnp.arange(scene.model.nu, dtype=jnp.float32))
+                np.testing.assert_array_equal(effect.servo(theta, state, ctrl), ctrl)
+            if effect.profile:
+                given = jnp.sin(jnp.arange(3.0 * scene.model.nu)).reshape(3, -1)
+                np.testing.assert_array_equal(effect.profile(theta, given, 0.002), given)
+            if effect.command:
+                np.testing.assert_array_equal(effect.command(theta, state.time, jnp.sin), jnp.sin(state.time))
     if effect.observe:
         rollout = trace(scene)
-        jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
+        for theta in thetas:
+            jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
 
 
 @pytest.mark.parametrize("effect", having("shape_parameters"), indirect=True)
@@ -216,10 +223,6 @@ def physics_of(scene: Scene, name: str) -> Callable[[np.ndarray], Physics]:
 @pytest.fixture
 def apply(scene: Scene, effect: Effect) -> Callable[[np.ndarray], Physics]:
     return physics_of(scene, effect.name)
-
-
-# The door's physics compile for ten seconds each.
-OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", marks=pytest.mark.slow)], indirect=True)
 
 
 @OF_BOTH
