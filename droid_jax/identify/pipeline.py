@@ -55,8 +55,8 @@ class IdentifyConfig:
         beginning: s of long recordings that the search and the first refinement see, and more until every joint has
             moved through half of its range; the last refinement sees all.
         sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`).
-        stale: share of a single repeat's stated noise, in squares; where a refinement leaves less, noise is stated
-            once more and the refinement goes on,
+        stale: share of a single repeat's squared residual that the noise was stated from; where a refinement leaves
+            less, the noise is stated once more and the refinement goes on,
         restatements: so many times at most.
         samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
         sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
@@ -431,17 +431,18 @@ def _refined(
         base, count = base.restated(first.best), count + first.evaluations
     last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)
     for _ in range(config.restatements):
-        if _least_share(base, last.best) > config.stale:
+        if _least_share(base, np.stack([first.best, last.best])) > config.stale:
             break
-        base, count = base.restated(last.best), count + last.evaluations
-        last = run(base, None, last.best, settled)
+        base, first, count = base.restated(last.best), last, count + last.evaluations
+        last = run(base, None, first.best, settled)
     return base, replace(last, evaluations=count + last.evaluations)
 
 
-def _least_share(cost: Cost, values: np.ndarray) -> float:
-    """Least mean square, over recordings of one repeat, of what `values` [F] leave in units of the stated noise."""
-    alone = [cost.alone(k) for k, c in enumerate(cost.comparisons) if c.repeats == 1]
-    return min(float(np.mean(one.whitened(values[None]) ** 2)) for one in alone)
+def _least_share(cost: Cost, rows: np.ndarray) -> float:
+    """Least share, over recordings of one repeat, that the second of two rows [2, F] leaves of the first's squares."""
+    alone = (cost.alone(k) for k, c in enumerate(cost.comparisons) if c.repeats == 1)
+    squares = [np.sum(one.whitened(rows) ** 2, axis=1) for one in alone]
+    return min(float(after / max(before, 1e-30)) for before, after in squares)
 
 
 def _fingerprint(
