@@ -10,7 +10,7 @@ of a log are what.  `evaluate-fit` replays the other motions open loop, over the
 
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
 control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml.  They are not part of this repository.
-Dry friction is made hard (`solimpfriction`): MuJoCo's own default creeps, and the arm stands still.
+MuJoCo's default friction creeps where the arm stands still; a fit holds it (`--joint-friction`).
 
 With --gap: what does a model of 24 parameters and a delay (gain, armature, damping and friction of each of the six
 joints) with MuJoCo's default friction lack?  `gap` searches the four motions, and the two others are its test data.
@@ -19,7 +19,6 @@ joints) with MuJoCo's default friction lack?  `gap` searches the four motions, a
 from __future__ import annotations
 
 import json
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,9 +44,8 @@ JUDGES = ("multisine", "velocity_ramp", "step_response", "trapezoidal_profile")
 SOURCE = (
     "Logs of isaac-sim2real/sage of an SO-101: a folder for each motion with control.csv.gz and state_motor.csv.gz."
 )
-SECONDS = 120.0
+SECONDS = 1e9  # all of it
 EFFECTS = ("profile_acceleration",)
-HARD = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction
 # Of each joint in the search: an entry of a parameter file, but for its name and its joints.
 OF_A_JOINT: dict[str, dict[str, Any]] = {
     "kp": {"std": 0.4, "low": 0.2, "high": 5.0},
@@ -88,17 +86,11 @@ def so101_log(folder: Path, motion: str, seconds: float) -> Recording:
     return recording.window(0.0, seconds) if seconds < recording.duration else recording
 
 
-def hard_scene(folder: Path, out: Path) -> Path:
-    """The arm's MJCF with hard dry friction, as a file of its own."""
-    source = folder / "so101_air.xml"
-    if not source.is_file():
-        raise FileNotFoundError(f"no file {source}; --data is the folder that holds the arm's MJCF. {SOURCE}")
-    text, count = re.subn(r'(<joint type="hinge")', rf'\1 solimpfriction="{HARD}"', source.read_text(), count=1)
-    if count != 1:
-        raise ValueError(f"{source}: expected a default joint of type hinge")
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / "so101_hard.xml"
-    path.write_text(text)
+def scene_of(folder: Path) -> Path:
+    """The arm's MJCF."""
+    path = folder / "so101_air.xml"
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}; --data is the folder that holds the arm's MJCF. {SOURCE}")
     return path
 
 
@@ -117,7 +109,7 @@ def parameters_of_joints(path: Path) -> Path:
 
 def with_held_friction(config: RealSo101, parameters: Path, extended: Path, logs: list[Recording]) -> dict[str, float]:
     """mrad, mean absolute error of the first five joints over whole motions: the search's values and hard friction."""
-    scene = load_scene(config.data / "so101_air.xml", friction_joints=friction_joints(parameters), hold=True)
+    scene = load_scene(scene_of(config.data), friction_joints=friction_joints(parameters), hold=True)
     space, known = load_parameters(parameters, scene), json.loads(extended.read_text())["values"]
     values = space.values({name: known[name] for name in space.names})
     replays = evaluate_on(scene, space, logs, before=values, after=values, engine="mujoco")
@@ -138,7 +130,7 @@ def searched(config: RealSo101) -> dict[str, Any]:
     options += ["--budget", str(config.budget)] if config.budget else []
     began, parameters = time.monotonic(), parameters_of_joints(runs / "so101_24.json")
     command(
-        ["gap", "--scene", config.data / "so101_air.xml", "--joint-friction", "scene",
+        ["gap", "--scene", scene_of(config.data), "--joint-friction", "scene",
          "--parameters", parameters, *options, "--seed", str(config.seed),
          "--recording", *(paths[m] for m in JUDGES), "--judge-on", *(paths[m] for m in FIT), "--out", runs / "gap"]
     )  # fmt: skip
@@ -196,8 +188,9 @@ def main(config: RealSo101) -> None:
         *(["--generations", "3"] if config.quick else []),
     ]
     judge_on = [paths[name] for name in judges]
-    scene = hard_scene(config.data, runs)
-    found, took = fitted(scene, HERE / "so101.json", [paths[n] for n in fit], judge_on, runs / "identify", options)
+    found, took = fitted(
+        scene_of(config.data), HERE / "so101.json", [paths[n] for n in fit], judge_on, runs / "identify", options
+    )
     errors = evaluated(runs / "identify", [paths[name] for name in (*fit, *judges)], runs / "evaluation")["errors"]
     mae = {
         when: {name: round(1e3 * float(np.mean(of["position"][f"mae_{when}"])), 3) for name, of in errors.items()}
@@ -207,7 +200,7 @@ def main(config: RealSo101) -> None:
         "experiment": "real_so101",
         "source": SOURCE,
         "recordings": {r.name: r.sha256 for r in logs},
-        "seconds_of_each_motion": seconds,
+        "seconds_of_each_motion": {r.name: round(r.duration, 2) for r in logs},
         "mean_judged_mrad": round(float(np.mean([mae["after"][name] for name in judges])), 3),
         "mean_judged_mrad_before": round(float(np.mean([mae["before"][name] for name in judges])), 3),
         "mae_mrad": mae["after"],
