@@ -89,11 +89,8 @@ def _line(value: Any) -> dict[str, Any]:
     if hasattr(value, "generation"):
         text = f"cost {value.best_cost:.4g}  sigma {value.sigma:.2g}"
         return {"completed": value.generation, "total": value.generations, "text": text}
-    return {
-        "completed": value.iteration,
-        "total": value.iterations,
-        "text": f"mean square {value.mean_square:.3g} (noise: 1)",
-    }
+    text = f"mean square {value.mean_square:.3g} (noise: 1)"
+    return {"completed": value.iteration, "total": value.iterations, "text": text, "left": "at most"}  # mostly fewer
 
 
 @contextlib.contextmanager
@@ -163,10 +160,11 @@ class Lines:
     def report(self, stage: str, value: Any) -> None:
         """What `stages` yields."""
         line = self._line(stage, value)
-        self.show(stage, line.get("text", ""), line.get("completed", 0), line.get("total", 0))
+        counts = line.get("completed", 0), line.get("total", 0)
+        self.show(stage, line.get("text", ""), *counts, left=line.get("left", "about"))
 
-    def show(self, stage: str, text: str, done: float, total: float) -> None:
-        """Print where a stage stands, if it is time to."""
+    def show(self, stage: str, text: str, done: float, total: float, *, left: str = "about") -> None:
+        """Print where a stage stands, if it is time to; left: how sure the time left is."""
         now = self._clock()
         new = stage != self._stage
         if new:
@@ -177,9 +175,9 @@ class Lines:
             return
         self._last, spent = now, now - self._began
         more, since = done - self._first[1], now - self._first[0]
-        left = f", about {since * (total - done) / more:.0f} s left" if more > 0 and done < total else ""
+        rest = f", {left} {since * (total - done) / more:.0f} s left" if more > 0 and done < total else ""
         count = f" {done:.0f}/{total:.0f}" if total else ""
-        print(f"{stage}{count} {text}".rstrip() + f" ({spent:.0f} s{left})", flush=True)
+        print(f"{stage}{count} {text}".rstrip() + f" ({spent:.0f} s{rest})", flush=True)
 
 
 def needs_writer(wanted: bool) -> None:

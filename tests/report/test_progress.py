@@ -35,6 +35,14 @@ def test_a_log_gets_a_line_where_a_stage_begins_now_and_then_and_at_its_end(caps
     ]
 
 
+def test_a_limit_of_iterations_tells_the_most_time_left(capsys: pytest.CaptureFixture) -> None:
+    times = iter([0.0, 10.0, 40.0])
+    lines = progress.Lines(clock=lambda: next(times))
+    for iteration in (1, 2, 3):
+        lines.report("refine", SimpleNamespace(iteration=iteration, iterations=30, mean_square=2.0))
+    assert capsys.readouterr().out.splitlines()[-1].endswith("(40 s, at most 540 s left)")
+
+
 def test_stages_and_training_write_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture) -> None:
     with progress.stages(["refine"]) as report:
         report("refine", SimpleNamespace(iteration=1, iterations=30, mean_square=2.0))
