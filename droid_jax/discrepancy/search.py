@@ -33,7 +33,9 @@ from droid_jax.discrepancy.fitting import (
     remaining_residuals,
 )
 from droid_jax.discrepancy.selection import (
+    Reason,
     SelectionStep,
+    ValidationTest,
     much_more,
     selected,
     validation_tests,
@@ -447,6 +449,7 @@ def _decided(
         seed=case.config.seed,
         natural_bounds=case.natural_bounds,
     )
+    tests = without_small_gains(problem, before, tried, tests)
     tested = list(zip(tried, tests, strict=True))
     won = selected(tested, u0, problem.base_discrepancy, config)
     if won is None:
@@ -454,3 +457,27 @@ def _decided(
     tests = without_dominated(tested, won, case.effects, u0, config)
     winner, chosen = won
     return replace(done, tests=tuple(tests), selected=winner, chosen=chosen)
+
+
+def without_small_gains(
+    problem: Problem, before: FittedModel, tried: Sequence[FittedModel], tests: Sequence[ValidationTest]
+) -> list[ValidationTest]:
+    """The tests without a small gain as a reason where the model leaves nothing to find.
+
+    U of blocks holds the noise.  Where noise is most of it no effect takes a large share, however sure it is; so what
+    counts there is whether anything is left that chance would not leave.
+    """
+    out, case = list(tests), problem.case
+    if before.parts or case.train.resampling.repeated:
+        return out
+    needed = case.config.selection.least_share * problem.base_discrepancy
+    for k in np.argsort([t.discrepancy_validation for t in tests]).tolist():
+        taken = problem.base_discrepancy - tests[k].discrepancy_validation
+        if {r.reason for r in tests[k].reasons} != {Reason.SMALL_GAIN} or taken < needed or problem.late:
+            continue
+        problem.progress("score_test", tried[k].name)
+        found = score_test(case.train, tried[k], open_directions(problem.directions, tried[k]), case.config.seed)
+        if found.p < case.config.selection.significance:
+            break  # what explains less leaves more
+        out[k] = replace(tests[k], reasons=())
+    return out

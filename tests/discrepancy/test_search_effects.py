@@ -32,7 +32,7 @@ from droid_jax.discrepancy.search import (
     target_objective,
     without,
 )
-from droid_jax.discrepancy.selection import SelectionStep
+from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.identify.search import NotReplayed
@@ -64,6 +64,41 @@ def case_of(scene: Scene, space: Space, effects: tuple[Effect, ...], config: Dis
 
 def searched(case: Case) -> Any:
     return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
+
+
+# Where U holds the noise -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("repeated", "left", "reasons", "kept"),
+    [
+        (False, {"a": 0.3, "b": 0.02}, (Reason.SMALL_GAIN,), {"b", "c"}),  # b leaves something, a does not
+        (False, {"a": 0.02}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # the best one does: the others are not asked
+        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN,), {"c"}),  # c takes too little whatever it leaves
+        (False, {}, (Reason.SMALL_GAIN, Reason.NOT_CONFIRMED), {"a", "b", "c"}),
+        (True, {}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # U of repeats holds no noise
+    ],
+)
+def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
+    monkeypatch: pytest.MonkeyPatch, repeated: bool, left: dict[str, float], reasons: tuple[Reason, ...], kept: set[str]
+):
+    models: Any = [SimpleNamespace(name=name, parts=(), coefficients=()) for name in "cab"]
+    tests: Any = [
+        ValidationTest((), 0, 0.9, u, 0.001, {}, 1.0, tuple(Rejection(r, "") for r in reasons))
+        for u in (0.97, 0.9, 0.92)
+    ]
+    case = SimpleNamespace(
+        train=SimpleNamespace(resampling=SimpleNamespace(repeated=repeated)), config=DiscrepancyConfig()
+    )
+    problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
+    asked = dict(left)
+    monkeypatch.setattr(search, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name)))
+    base: Any = SimpleNamespace(parts=())
+    extended: Any = SimpleNamespace(parts=("drag",))
+    judged = search.without_small_gains(problem, base, models, tests)
+    assert {m.name for m, t in zip(models, judged, strict=True) if t.reasons} == kept
+    assert not asked  # each was asked once
+    assert search.without_small_gains(problem, extended, models, tests) == tests  # beside another effect
 
 
 # From state to state -----------------------------------------------------------------------
