@@ -108,6 +108,7 @@ def test_wrong(): assert False
 """
 
 
+@pytest.mark.slow
 def test_the_plugin_counts_cpu_and_not_wall_time_in_all_processes(tmp_path: Path):
     (tmp_path / "test_made_up.py").write_text(TESTS)
     command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "benchmarks.durations", f"{OPTION}=found.json"]

@@ -101,6 +101,7 @@ def test_the_hand_stays_on_the_knob_from_grasp_to_end(scene: Scene, shipped: Rec
     np.testing.assert_allclose(np.unwrap(heading), turned, atol=1e-5)  # the hand turns with the door
 
 
+@pytest.mark.slow
 def test_shipped_demonstrations_are_what_the_plans_make(scene: Scene):
     made, file = demonstrate(scene, PLANS["A"]), load_recording(demonstration_path("A"))
     np.testing.assert_allclose(made.command, file.command, atol=1e-6)

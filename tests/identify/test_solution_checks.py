@@ -100,6 +100,7 @@ def test_engines_that_differ_are_said():
     assert len(said) == 1 and "MJX and plain C MuJoCo differ at the fitted values of scene 'swing'" in said[0]
 
 
+@pytest.mark.slow
 def test_data_of_mj_step_have_no_error_of_its_step():
     recording = recorded()
     cost, values = cost_of(hinge(0.02), recording, mj_step=True)

@@ -268,6 +268,7 @@ def test_slopes_of_one_batch_are_those_of_two():
     assert one.objective == pytest.approx(two.objective)
 
 
+@pytest.mark.slow
 def test_plain_c_in_fine_steps_tells_the_step_error(hinge, effects: tuple[Effect, ...]):
     """The same order as the search's own, of the compiled replay at a quarter of its step."""
     scene, space = hinge
