@@ -470,7 +470,7 @@ def without_small_gains(
     out, case = list(tests), problem.case
     if before.parts or case.train.resampling.repeated:
         return out
-    needed = case.config.selection.least_share * problem.base_discrepancy
+    needed = case.config.blocks.least_gain * problem.base_discrepancy
     for k in np.argsort([t.discrepancy_validation for t in tests]).tolist():
         taken = problem.base_discrepancy - tests[k].discrepancy_validation
         if {r.reason for r in tests[k].reasons} != {Reason.SMALL_GAIN} or taken < needed or problem.late:
