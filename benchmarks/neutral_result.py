@@ -56,7 +56,7 @@ class NeutralResult:
 
 def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
     """Effects that only change the model's numbers."""
-    bare = dict(command=None, servo=None, force=None, frictionloss=None, observe=None)
+    bare = dict(profile=None, command=None, servo=None, force=None, frictionloss=None, observe=None)
     return tuple(replace(e, **bare) for e in effects)
 
 
@@ -169,7 +169,7 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) 
     from droid_jax.simulate.replay import make_drive, servo_replay
 
     drive = make_drive(fitted.scene, recording, weigh=False)
-    laws = sorted(e.name for e in effects if e.command or e.servo or e.force or e.frictionloss)
+    laws = sorted(e.name for e in effects if e.profile or e.command or e.servo or e.force or e.frictionloss)
     numbers = hashlib.sha256(np.asarray(fitted.after).tobytes() + recording.sha256.encode() + str(laws).encode())
     kept = runs / f"{numbers.hexdigest()[:16]}.npz"
     if kept.is_file():

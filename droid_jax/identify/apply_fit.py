@@ -9,7 +9,7 @@
     data = mujoco.MjData(model)
     laws = apply_fit.forces(model, fit, values)             # what no MJCF can hold; nothing where there is nothing
     for command in commands:
-        data.ctrl[:] = laws.control(data, command)          # a delay, a gear that gives way
+        data.ctrl[:] = laws.control(data, command)          # a servo's ramps, a delay, a gear that gives way
         laws(model, data)                                   # a latch, a friction that goes with the load
         mujoco.mj_step(model, data)
 
@@ -357,13 +357,19 @@ class Laws:
 
     def __init__(self, model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
         self.model, self.own = model, np.zeros(model.nv)
-        self._force, self._friction, self._servo, self.delay = [], [], [], 0.0
+        self._force, self._friction, self._servo, self._goals, self.delay = [], [], [], [], 0.0
+        self._now = math.inf
         for law in fit["laws"]:
             tables = [(values[t["parameter"]] if t["parameter"] else 1.0, np.array(t["table"])) for t in law["terms"]]
             if law["acts"] == "command":
                 self.delay += float(sum(size * table for size, table in tables))
                 continue
             joint = model.joint(law["joint"]).id
+            if law["acts"] in ("acceleration", "speed"):
+                inverse = float(sum(size * table for size, table in tables))
+                if inverse > 0:
+                    self._goals.append(_Goal(_drive(model, joint), law["acts"], 1.0 / inverse))
+                continue
             shapes = [a for a in law["axes"] if a["name"] in values]
             table = sum(size * _at(table, shapes, values) for size, table in tables)
             axes = [(a["name"], np.array(a["nodes"])) for a in law["axes"] if a["name"] not in values]
@@ -407,8 +413,14 @@ class Laws:
             data.efc_frictionloss[rows] = loss[data.efc_id[rows]]
 
     def control(self, data: mujoco.MjData, command: Any) -> np.ndarray:
-        """[nu] what the actuators get for a command [nu] given at data.time: later by the delay, through the gears."""
+        """[nu] what the actuators get for a command [nu] given at data.time: along the servos' own ramps, later by the
+        delay, through the gears.
+        """
         ctrl = np.array(command, dtype=float)
+        if self._goals:
+            step, self._now = float(data.time) - self._now, float(data.time)
+            for goal in self._goals:
+                ctrl[goal.actuator] = goal(ctrl[goal.actuator], step)
         if self.delay > 0:
             if self._sent and data.time < self._sent[-1][0]:
                 self._sent.clear()  # the simulation started over
@@ -427,12 +439,39 @@ class Laws:
         """Controls at which the servos give the torque that a gear which gives way lets through."""
         m, out = self.model, ctrl.copy()
         for table in self._servo:
-            u = int(np.flatnonzero((m.actuator_trnid[:, 0] == table.joint) & (m.actuator_trntype == 0))[0])
+            u = _drive(m, table.joint)
             gear, gain, bias = m.actuator_gear[u, 0], m.actuator_gainprm[u, 0], m.actuator_biasprm[u]
             length, speed = gear * data.qpos[table.qpos], gear * data.qvel[table.dof]
             rigid = gear * (gain * out[u] + bias[0] + bias[1] * length + bias[2] * speed)
             out[u] += table.at([rigid]) / (gear * gain)
         return out
+
+
+def _drive(model: mujoco.MjModel, joint: int) -> int:
+    """The actuator of a joint."""
+    return int(np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0))[0])
+
+
+class _Goal:
+    """The place that a servo follows in place of its command: it speeds up, or moves, no faster than its limit."""
+
+    def __init__(self, actuator: int, acts: str, most: float) -> None:
+        self.actuator, self.acts, self.most = actuator, acts, most
+        self.place, self.speed = 0.0, 0.0
+
+    def __call__(self, command: float, step: float) -> float:
+        """The place so long [s] after the last one; it starts at the command and at rest, also where time goes back."""
+        if step <= 0:
+            self.place, self.speed = (self.place, self.speed) if step == 0 else (command, 0.0)
+            return self.place
+        way = command - self.place
+        if self.acts == "speed":
+            self.speed = min(max(way / step, -self.most), self.most)
+        else:  # no faster than it can brake
+            wanted = math.copysign(min(abs(way) / step, math.sqrt(2 * self.most * abs(way))), way)
+            self.speed += min(max(wanted - self.speed, -self.most * step), self.most * step)
+        self.place += self.speed * step
+        return self.place
 
 
 class _Table:

@@ -119,7 +119,7 @@ def neutral_json(
     for inertia in inertias:
         _weigh(rows, inertia, named, drawn)
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    laws = [e for e in effects if e.command or e.servo or e.force or e.frictionloss]
+    laws = [e for e in effects if e.profile or e.command or e.servo or e.force or e.frictionloss]
     fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
     tables = list(law_tables(scene, fitted, laws, named, deviations))
     at = {(row["field"], *row["own"]): row for row in rows}

@@ -75,6 +75,8 @@ class Effect:
                   at which a replay is as without it.
     profile:      (theta, command [T, U], s between its rows) -> [T, U], what a servo makes of the whole command, before
                   any law of `command`.
+    profile_limits: "acceleration" or "speed" where `profile` limits that of a joint's goal to one over its amplitude,
+                  so that programs without this one can; empty for another path.
     command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
     servo:        (theta, State, ctrl [U]) -> [U], what the servo is given in place of the command.
     force:        (theta, State) -> [nv] generalised force added to qfrc_applied.
@@ -99,6 +101,7 @@ class Effect:
     name: str
     parameters: tuple[Parameter, ...] = ()
     profile: Callable[[Theta, jax.Array, float], jax.Array] | None = None
+    profile_limits: str = ""
     command: Callable[[Theta, jax.Array, Callable], jax.Array] | None = None
     servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     force: Callable[[Theta, State], jax.Array] | None = None

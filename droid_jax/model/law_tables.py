@@ -35,7 +35,8 @@ class LawTable:
     """A law on one joint: sum over terms of (parameter, or 1 where it is None) times its table.
 
     acts: "force" (added to qfrc_applied), "frictionloss" (added to the joint's), "servo" (added to the torque of the
-    position servo) or "command" (delay of the command, s).  axes: shape parameters
+    position servo), "command" (delay of the command, s), "acceleration" or "speed" (one over the limit that the servo
+    sets to its own goal).  axes: shape parameters
     first, then variables: "position", "speed", "load" or "torque" (the servo's without the law).  terms:
     (parameter, table over the axes).  error, error_of_draws: largest difference to the law
     between the nodes at the fitted values, and anywhere, `unit`.
@@ -89,6 +90,8 @@ def law_tables(
 
 def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
     effect = law.effect
+    if effect.profile is not None:
+        yield law.limit()
     if effect.command is not None:
         yield law.delay()
     for acts, function in (("force", effect.force), ("frictionloss", effect.frictionloss)):
@@ -128,6 +131,17 @@ class _Law:
     def theta(self, given: dict[str, Any]) -> dict[str, Any]:
         """What the law reads, other locations at neutral."""
         return dict(complete({n: jnp.float32(given[n]) for n in self.parameters}, [self.effect]))
+
+    def limit(self) -> LawTable | NoTable:
+        """One over the most that a servo lets its own goal speed up, or move, as the effect says of itself."""
+        effect, unit = self.effect, {p.name: p.unit for p in self.effect.parameters}
+        if not effect.profile_limits or self.location not in self.scene.driven_joints or len(self.parameters) != 1:
+            return self.without("it draws a path of its own between two goals")
+        (name,) = self.parameters
+        acts, terms = effect.profile_limits, ((name, np.array(1.0)),)
+        return LawTable(
+            effect.name, self.location, effect.description, acts, self.location, unit[name], (), terms, 0.0, 0.0
+        )
 
     def delay(self) -> LawTable | NoTable:
         """How late the command comes, s."""

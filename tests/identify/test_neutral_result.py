@@ -235,6 +235,32 @@ def test_commands_come_late(made: Made):
     np.testing.assert_allclose(got, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("name", "size"), [("profile_acceleration", 0.05), ("profile_speed", 0.9)])
+def test_a_servo_draws_its_own_ramps(made: Made, tmp_path: Path, name: str, size: float):
+    """As the effect does to a command on the replay's clock; once more where the simulation starts over."""
+    (effect,) = effects = library(made.scene, [name])
+    space = effect_space(effects).select([f"{name}[elbow]"])
+    write_neutral(tmp_path, made.scene, prior(space), np.array([size]), effects, main="fitted.xml")
+    fit = apply_fit.load(tmp_path / "fitted.json")
+    (law,), (lacking,) = fit["laws"], fit["not_in_mjcf"]
+    assert law["joint"] == "elbow" and "has its law" in lacking["why"]
+    model = mujoco.MjModel.from_xml_path(str(SCENE))
+    laws, data, clock = apply_fit.forces(model, fit), mujoco.MjData(model), 0.002 * np.arange(400)
+    command = np.where(clock < 0.3, 0.2, -0.5)[:, None] + 0.3 * np.sin(9.0 * clock)[:, None] * np.ones(model.nu)
+    assert effect.profile is not None
+    theta = complete({f"{name}[elbow]": jnp.float32(size)}, effects)
+    expected = np.asarray(effect.profile(theta, jnp.asarray(command, jnp.float32), 0.002))
+    u = made.scene.command_names.index("elbow")
+    assert np.abs(expected[:, u] - command[:, u]).max() > 0.2
+    for _ in range(2):
+        got = np.empty_like(command)
+        for k, at in enumerate(clock.tolist()):
+            data.time = at
+            got[k] = laws.control(data, command[k])
+            np.testing.assert_array_equal(laws.control(data, command[k]), got[k])  # asked twice in a step
+        np.testing.assert_allclose(got, expected, atol=2e-3)
+
+
 def replayed(made: Made, folder: Path, **ask: Any) -> tuple[Any, Any]:
     """In plain C, in a process without jax, and the drive."""
     motor = replace(demonstration("test"), torque=TorqueConvention(TorqueSide.MOTOR, gravity=True))
