@@ -105,6 +105,7 @@ class BlocksConfig:
     fitted_share: of a recording whose remaining part is test data.
     noise_share: share of the base model's squared residual below which what the best candidates leave counts as noise;
         the best of many candidates takes noise too, of slow noise up to three quarters (40 synthetic door logs).
+    refit_share: share of a column's squared residual that a candidate must take linearly to be fitted in full for that.
     least_gain: share of U, noise included, that a first effect must take where it leaves nothing to find, in place of
         `SelectionConfig.least_gain` (an arm's log with nothing hidden and p = 0.002: 5 %; two with: 10 and 13 %).
     equivalence_factor: as `SelectionConfig.equivalence_factor`; closer to one, since U of a block holds the noise.
@@ -116,6 +117,7 @@ class BlocksConfig:
     shortest: float = 0.5
     fitted_share: float = 2 / 3
     noise_share: float = 0.2
+    refit_share: float = 0.3
     least_gain: float = 0.08
     equivalence_factor: float = 1.5
     prior_slack: float = 30.0
@@ -125,7 +127,9 @@ class BlocksConfig:
             self,
             **dict.fromkeys(("correlation_times", "shortest"), partial(number, least=0)),
             **dict.fromkeys(("equivalence_factor", "prior_slack"), partial(number, least=1)),
-            **dict.fromkeys(("fitted_share", "noise_share", "least_gain"), partial(number, least=0, most=1)),
+            **dict.fromkeys(
+                ("fitted_share", "noise_share", "refit_share", "least_gain"), partial(number, least=0, most=1)
+            ),
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from droid_jax.cost.lone_log import LoneLog, lone_log
 from droid_jax.cost.noise import stated_deviation
 from droid_jax.cost.windowed_log import WindowedLog, windowed_log
-from droid_jax.discrepancy.candidates import ScoreTest, directions_of, proposals, score_test
+from droid_jax.discrepancy.candidates import Proposal, ScoreTest, directions_of, proposals, score_test
 from droid_jax.discrepancy.case import (
     Case,
     ResidualSet,
@@ -33,6 +33,7 @@ from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, interleaved
 from droid_jax.identify.evaluation import evaluate_on, evaluation_json
 from droid_jax.identify.multistart import RefineProgress
+from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
@@ -146,9 +147,10 @@ def noise_of(
     One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual that
     an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, in columns where
     that is less than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base
-    leaves.  The fifth is there because the best of many candidates takes noise too, and what it leaves is correlated
-    for too short a time.  It is asked of each column: a clock at another rate shows in positions, and a torque sensor's
-    noise stays whatever explains them.
+    leaves.  A candidate that takes much of a column is fitted in full too: a strong effect is not linear.  The fifth is
+    there because the best of many candidates takes noise too, and what it leaves is correlated for too short a time.
+    It is asked of each column: a clock at another rate shows in positions, and a torque sensor's noise stays whatever
+    explains them.
     So with something missing that the library explains in part only, noise is stated too large and blocks are long:
     intervals are wide and less is named.  A discrepancy in these units is no absolute size, but ratios of
     discrepancies are free of the unit.
@@ -163,12 +165,43 @@ def noise_of(
     common = model.residuals.mean(axis=0)
     both = common, least_residual(found, common, log.space, config)
     whole, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in both)
+    if (refitted := refitted_residual(case, model, found, len(deviation))) is not None:
+        other = (refitted.reshape(len(deviation), -1).T * deviation)[inside]
+        rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
     left = noise_left(whole, rest, config.blocks.noise_share)
     rate = config.compare.noise.rate
     stated = stated_deviation(left, log.moves[inside], rate)
     # Each window begins at its own measured state, so that what they leave of slow noise is short.
     lasting = rest if isinstance(log, WindowedLog) else left
     return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
+
+
+def refitted_residual(case: Case, model: FittedModel, found: ScoreTest, columns: int) -> np.ndarray | None:
+    """[M] what the candidate that takes most of any one column leaves once it is fitted in full; None where none takes
+    `BlocksConfig.refit_share` of a column.
+
+    Of many columns an effect at one joint explains few, and so a small share of all.
+    """
+    space, common = case.full_space, model.residuals.mean(axis=0)
+    whole = np.sum(common.reshape(columns, -1) ** 2, axis=1)
+
+    def share(proposal: Proposal) -> float:
+        """Of the column in which it leaves least."""
+        keys = {part.shaped_key for part in proposal.parts}
+        rows = [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
+        sizes = [proposal.sizes[found.directions[k].coefficient] for k in rows]
+        left = common - sizes @ found.sensitivities[rows]
+        return float(np.min(np.sum(left.reshape(columns, -1) ** 2, axis=1) / np.maximum(whole, 1e-30)))
+
+    ranked = [(share(proposal), k, proposal) for k, proposal in enumerate(proposals(found, common[None], space))]
+    least, _, best = min(ranked)
+    if least > 1 - case.config.blocks.refit_share:
+        return None
+    try:
+        fitted = refit(case.train, case.base, best.parts, best.start(space, model.values)[None], case.config.refit)
+    except NotReplayed:
+        return None
+    return fitted.residuals.mean(axis=0)
 
 
 def noise_left(whole: np.ndarray, least: np.ndarray, share: float) -> np.ndarray:
