@@ -19,7 +19,7 @@ from droid_jax.model.inertia import PSEUDO_INERTIA
 from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumber, WantedNumber, edit
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene
+from droid_jax.model.scene import SOFT_IMPEDANCE, Scene
 from droid_jax.model.visual_geoms import compiled, keep_inertia, look_geoms, weigh
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
@@ -163,6 +163,12 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
         for row, element in elements.items():
             changed += [(kind, element, row, f) for f in _write_changed(kind, element, row, scene.model, model)]
     changed += [("actuator", a, a.id, "actuator_biasprm") for a in _settle(spec, model)]
+    changed += [
+        ("dof", e, row, "dof_solimp") for row, e in _elements(spec, model)["dof"].items() if e.name in scene.held
+    ]
+    for joint in before.joints:  # friction that holds here creeps in the user's file
+        if joint.name in scene.held:
+            joint.solimp_friction = list(SOFT_IMPEDANCE)
     keep_inertia(spec, model)
     try:
         written = compiled(spec)

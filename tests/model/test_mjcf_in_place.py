@@ -106,6 +106,21 @@ def test_only_numbers_change_and_the_model_is_the_fitted_one(scene: Scene, tmp_p
     assert "diaginertia" in arm and 'range="-45 ' in arm
 
 
+def test_friction_that_a_fit_holds_is_held_in_the_own_file(tmp_path: Path, scene: Scene):
+    """On the joints that the scene holds; the others keep what the file says."""
+    held = load_scene(tmp_path / "robot.xml", hold=True)
+    assert set(held.held) == {"swing", "twist"}
+    space = Space((joint_damping(held, "swing", std=1.0, high=20.0),))
+    made = fitted_files(held, space, space.mean + 0.7 * space.std)
+    assert made.in_place, made.reason
+    model = written(made, tmp_path / "elsewhere")
+    np.testing.assert_allclose(model.dof_solimp, held.model.dof_solimp)
+    assert np.ptp(model.dof_solimp[:, 0]) > 0.09  # the rail has no friction
+    changes = {(c.name, c.index): (c.before, c.after) for c in made.changes if c.attribute == "solimpfriction"}
+    assert changes == {(n, i): (soft, 0.9999) for n in held.held for i, soft in enumerate((0.9, 0.95))}
+    assert "solimpfriction" not in made.files["fitted.xml"] and made.files["fitted_parts/arm.xml"].count("0.9999") == 4
+
+
 def test_the_patch_changes_the_own_files(scene: Scene, tmp_path: Path):
     """By the program `patch`, where there is one; without paths, which only the copy needs."""
     import shutil
