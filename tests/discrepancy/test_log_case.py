@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.lone_log import LoneLog
+from droid_jax.discrepancy import log_case
 from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
-from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, single_case
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, refitted_residual, single_case
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
@@ -93,6 +97,38 @@ def test_noise_is_what_candidates_leave_in_the_columns_that_they_explain():
     left = noise_left(whole, noise, 0.2)
     assert np.array_equal(left, noise)
     assert np.array_equal(noise_left(whole, 0.5 * whole, 0.2), whole)
+
+
+@pytest.mark.parametrize(("size", "fitted"), [(1.0, True), (0.3, False)])  # of the effect; noise is 1
+def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.MonkeyPatch, size: float, fitted: bool):
+    """Of six columns it takes a ninth of all, and half of one."""
+    columns, count, rng = 6, 500, np.random.default_rng(1)
+    mark = np.zeros((columns, count))
+    mark[4] = np.sqrt(2) * np.sin(np.linspace(0, 60, count))
+    left = (rng.normal(size=(columns, count)) + size * mark).ravel()
+    candidate: Any = SimpleNamespace(shaped_key="right")
+    best: Any = SimpleNamespace(parts=(candidate,), sizes={"a": size}, start=lambda space, values: values)
+    other: Any = SimpleNamespace(parts=(SimpleNamespace(shaped_key="wrong"),), sizes={"b": 0.1}, start=best.start)
+    found: Any = SimpleNamespace(
+        directions=[
+            SimpleNamespace(candidate=SimpleNamespace(shaped_key=k), coefficient=c)
+            for k, c in (("wrong", "b"), ("right", "a"))
+        ],
+        sensitivities=np.stack([rng.normal(size=columns * count), mark.ravel()]),
+    )
+    asked = list[Any]()
+
+    def refit(train: Any, base: Any, parts: Any, *rest: Any) -> Any:
+        asked.append(parts)
+        return SimpleNamespace(residuals=np.tile(left - size * mark.ravel(), (3, 1)))
+
+    monkeypatch.setattr(log_case, "proposals", lambda *given: [other, best])
+    monkeypatch.setattr(log_case, "refit", refit)
+    case: Any = SimpleNamespace(train=None, base=None, full_space=None, config=DiscrepancyConfig())
+    model: Any = SimpleNamespace(residuals=np.tile(left, (3, 1)), values=np.zeros(2))
+    got = refitted_residual(case, model, found, columns)
+    assert asked == ([(candidate,)] if fitted else [])
+    assert got is None if not fitted else got == pytest.approx(left - size * mark.ravel())
 
 
 def two_joints() -> Scene:
