@@ -33,6 +33,7 @@ from droid_jax.discrepancy.fitting import (
     remaining_residuals,
 )
 from droid_jax.discrepancy.selection import (
+    WEAK,
     Reason,
     SelectionStep,
     ValidationTest,
@@ -465,7 +466,8 @@ def without_small_gains(
     """The tests without a small gain as a reason where the model leaves nothing to find.
 
     U of blocks holds the noise.  Where noise is most of it no effect takes a large share, however sure it is; so what
-    counts there is whether anything is left that chance would not leave.
+    counts there is whether anything is left that chance would not leave.  A model that is weak besides is asked too:
+    it may do better than one that passes, and nothing is named then.
     """
     out, case = list(tests), problem.case
     if before.parts or case.train.resampling.repeated:
@@ -473,11 +475,11 @@ def without_small_gains(
     needed = case.config.blocks.least_gain * problem.base_discrepancy
     for k in np.argsort([t.discrepancy_validation for t in tests]).tolist():
         taken = problem.base_discrepancy - tests[k].discrepancy_validation
-        if {r.reason for r in tests[k].reasons} != {Reason.SMALL_GAIN} or taken < needed or problem.late:
+        if {r.reason for r in tests[k].reasons} - WEAK != {Reason.SMALL_GAIN} or taken < needed or problem.late:
             continue
         problem.progress("score_test", tried[k].name)
         found = score_test(case.train, tried[k], open_directions(problem.directions, tried[k]), case.config.seed)
         if found.p < case.config.selection.significance:
             break  # what explains less leaves more
-        out[k] = replace(tests[k], reasons=())
+        out[k] = replace(tests[k], reasons=tuple(r for r in tests[k].reasons if r.reason is not Reason.SMALL_GAIN))
     return out

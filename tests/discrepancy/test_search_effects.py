@@ -75,7 +75,8 @@ def searched(case: Case) -> Any:
         (False, {"a": 0.3, "b": 0.02}, (Reason.SMALL_GAIN,), {"b", "c"}),  # b leaves something, a does not
         (False, {"a": 0.02}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # the best one does: the others are not asked
         (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN,), {"c"}),  # c takes too little whatever it leaves
-        (False, {}, (Reason.SMALL_GAIN, Reason.NOT_CONFIRMED), {"a", "b", "c"}),
+        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN, Reason.NOT_CONFIRMED), {"c"}),  # weak, and may be the truth
+        (False, {}, (Reason.SMALL_GAIN, Reason.MAY_BE_ZERO), {"a", "b", "c"}),
         (True, {}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # U of repeats holds no noise
     ],
 )
@@ -96,7 +97,12 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     base: Any = SimpleNamespace(parts=())
     extended: Any = SimpleNamespace(parts=("drag",))
     judged = search.without_small_gains(problem, base, models, tests)
-    assert {m.name for m, t in zip(models, judged, strict=True) if t.reasons} == kept
+    small = [any(r.reason is Reason.SMALL_GAIN for r in t.reasons) for t in judged]
+    assert {m.name for m, too_small in zip(models, small, strict=True) if too_small} == kept
+    assert all(
+        {*t.reasons} >= {r for r in before.reasons if r.reason is not Reason.SMALL_GAIN}
+        for t, before in zip(judged, tests, strict=True)
+    )
     assert not asked  # each was asked once
     assert search.without_small_gains(problem, extended, models, tests) == tests  # beside another effect
 
