@@ -147,10 +147,11 @@ def noise_of(
     One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual that
     an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, in columns where
     that is less than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base
-    leaves.  A candidate that takes much of a column is fitted in full too: a strong effect is not linear.  The fifth is
-    there because the best of many candidates takes noise too, and what it leaves is correlated for too short a time.
-    It is asked of each column: a clock at another rate shows in positions, and a torque sensor's noise stays whatever
-    explains them.
+    leaves.  Of a commanded log a candidate that takes much of a column is fitted in full too: in a replay a strong
+    effect is not linear.
+    The fifth is there because the best of many candidates takes noise too, and what it leaves is correlated for too
+    short a time.  It is asked of each column: a clock at another rate shows in positions, and a torque sensor's noise
+    stays whatever explains them.
     So with something missing that the library explains in part only, noise is stated too large and blocks are long:
     intervals are wide and less is named.  A discrepancy in these units is no absolute size, but ratios of
     discrepancies are free of the unit.
@@ -165,7 +166,9 @@ def noise_of(
     common = model.residuals.mean(axis=0)
     both = common, least_residual(found, common, log.space, config)
     whole, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in both)
-    if (refitted := refitted_residual(case, model, found, len(deviation))) is not None:
+    # Inverse dynamics is nearly linear in what an effect adds; a replay is not.
+    refitted = refitted_residual(case, model, found, len(deviation)) if isinstance(log, WindowedLog) else None
+    if refitted is not None:
         other = (refitted.reshape(len(deviation), -1).T * deviation)[inside]
         rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
     left = noise_left(whole, rest, config.blocks.noise_share)
