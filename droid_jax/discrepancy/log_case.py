@@ -164,12 +164,16 @@ def noise_of(
     case, model, deviation = _rough_fit(log, base, effects, start, block, config)
     found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
     common = model.residuals.mean(axis=0)
-    both = common, least_residual(found, common, log.space, config)
-    whole, rest = ((of.reshape(len(deviation), -1).T * deviation)[inside] for of in both)
+
+    def by_column(residual: np.ndarray) -> np.ndarray:
+        """[K, C] in physical units of [M] in units of the stated deviation, of what is inside."""
+        return (residual.reshape(len(deviation), -1).T * deviation)[inside]
+
+    whole, rest = by_column(common), by_column(least_residual(found, common, log.space, config))
     # Inverse dynamics is nearly linear in what an effect adds; a replay is not.
     refitted = refitted_residual(case, model, found, len(deviation)) if isinstance(log, WindowedLog) else None
     if refitted is not None:
-        other = (refitted.reshape(len(deviation), -1).T * deviation)[inside]
+        other = by_column(refitted)
         rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
     left = noise_left(whole, rest, config.blocks.noise_share)
     rate = config.compare.noise.rate
@@ -190,8 +194,7 @@ def refitted_residual(case: Case, model: FittedModel, found: ScoreTest, columns:
 
     def share(proposal: Proposal) -> float:
         """Of the column in which it leaves least."""
-        keys = {part.shaped_key for part in proposal.parts}
-        rows = [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
+        rows = _rows_of(found, proposal)
         sizes = [proposal.sizes[found.directions[k].coefficient] for k in rows]
         left = common - sizes @ found.sensitivities[rows]
         return float(np.min(np.sum(left.reshape(columns, -1) ** 2, axis=1) / np.maximum(whole, 1e-30)))
@@ -240,12 +243,16 @@ def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: Dis
         best = proposals(found, left[None], space)[0]
         if best.explained < config.selection.least_gain:
             break
-        keys = {part.shaped_key for part in best.parts}
-        rows = [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
-        taken, _ = np.linalg.qr(found.sensitivities[rows].T)
+        taken, _ = np.linalg.qr(found.sensitivities[_rows_of(found, best)].T)
         left = left - taken @ (taken.T @ left)
         found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
     return left
+
+
+def _rows_of(found: ScoreTest, proposal: Proposal) -> list[int]:
+    """The directions of a proposal's candidates, in the shapes proposed."""
+    keys = {part.shaped_key for part in proposal.parts}
+    return [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
 
 
 def with_blocks(

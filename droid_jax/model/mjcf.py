@@ -159,7 +159,8 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
     compiled(spec)  # numbers its elements, of which not all need a name
     compiled(before)
     changed: list[tuple[str, Any, int, str]] = []
-    for kind, elements in _elements(spec, model).items():
+    by_kind = _elements(spec, model)
+    for kind, elements in by_kind.items():
         for row, element in elements.items():
             changed += [(kind, element, row, f) for f in _write_changed(kind, element, row, scene.model, model)]
     changed += [("actuator", a, a.id, "actuator_biasprm") for a in _settle(spec, model)]

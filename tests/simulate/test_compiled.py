@@ -59,7 +59,7 @@ def base(scene: Scene) -> tuple[Effect, list[float], np.ndarray]:
 def test_other_commands_starts_and_bounds_share_a_program(
     scene: Scene, base: tuple[Effect, list[float], np.ndarray], monkeypatch: pytest.MonkeyPatch
 ):
-    """And another effect has one of its own: here with no more room than the motion needs, which changes no replay."""
+    """And another effect has one of its own: here as long as the motion alone needs, which changes no replay."""
     effect, traced, first = base
     count, command = len(traced), motion()[1]
     slower = recording(name="slower", command=0.5 * command + 0.5 * command[0])

@@ -181,7 +181,7 @@ def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
         assert np.asarray(c.finite).all() and np.ptp(np.asarray(c.torque), axis=0).max() > 0.1
         paths = jax.tree.map(lambda a: jnp.stack([a, a]), motion_path(scene, follows))
         np.testing.assert_allclose(other.torques(paths), np.stack([mjx.torque[0]] * 2), atol=5e-5)  # at the means
-        if side is LINK:  # MJX compiles them anew
+        if side is LINK:  # MJX compiles them again
             np.testing.assert_allclose(other.torques(paths), one.torques(paths), atol=5e-5)
 
 
