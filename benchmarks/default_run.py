@@ -1,10 +1,11 @@
 """The default command as a new user has it: how long until it speaks, what each stage takes, what comes of it.
 
-    python benchmarks/default_run.py [--quick] [--out DIR]
+    python benchmarks/default_run.py [--against CHECKOUT] [--quick] [--out DIR]
 
-Starts `python -m droid_jax.run` anew without options but its folder, in a process of its own and with an empty
-compilation cache, and keeps what it prints with the time of every line.  Writes DIR/default_run.json; the run's
-folder, with the page, is left in DIR/default_run.
+Starts `python -m droid_jax.run` without options but its folder, in a process of its own and with an empty compilation
+cache, and keeps what it prints with the time of every line.  With --against the same command of another commit runs
+before it, and this one's once more after it, with what it has compiled.  Writes DIR/default_run.json; the run's folder,
+with the page, is left in DIR/default_run.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ class Arguments:
 
     quick: bool = False
     """Stop the command where its first stage begins: shows that it starts, and how fast."""
+    against: Path | None = None
+    """Checkout of another commit whose default command is timed first (git worktree add --detach CHECKOUT COMMIT)."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of default_run.json."""
 
@@ -54,8 +57,8 @@ class Line(NamedTuple):
     text: str
 
 
-def command_lines(out: Path, cache: str) -> Iterator[Line]:
-    """Lines of the command as they come; the one who stops asking stops it.  RuntimeError where it fails.
+def command_lines(out: Path, cache: str, program: Path | None = None) -> Iterator[Line]:
+    """Lines of a checkout's command as they come; the one who stops asking stops it.  RuntimeError where it fails.
 
     It starts over where the folder holds a run, and in the folder above, so that no line names this machine's folders.
     """
@@ -63,7 +66,8 @@ def command_lines(out: Path, cache: str) -> Iterator[Line]:
     began = time.perf_counter()
     command = [sys.executable, "-u", "-m", "droid_jax.run", "all", "--out", out.name, "--again"]
     streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(command, cwd=out.parent, env=empty_cache(cache), **streams) as process:
+    environment = empty_cache(cache) | {"PYTHONPATH": str((program or ROOT).resolve())}
+    with subprocess.Popen(command, cwd=out.parent, env=environment, **streams) as process:
         assert process.stdout is not None
         try:
             last = ""
@@ -74,6 +78,28 @@ def command_lines(out: Path, cache: str) -> Iterator[Line]:
                 raise RuntimeError(f"the command ended with {process.returncode}: {last}")
         finally:
             process.terminate()
+
+
+def shown(lines: Iterator[Line], quick: bool) -> list[Line]:
+    """The lines, printed as they come; of a quick run those before its first stage."""
+    kept = list[Line]()
+    for line in lines:
+        print(line.text, flush=True)
+        kept.append(line)
+        if quick and PROGRESS.match(line.text):
+            break
+    return kept
+
+
+def of_another_commit(program: Path, out: Path, quick: bool) -> dict[str, Any]:
+    """Times of another checkout's command with an empty cache, and what it named; its folder is not kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / out.name
+        found: dict[str, Any] = figures(shown(command_lines(run, f"{folder}/cache", program), quick))
+        if not quick:
+            found |= {"effects": json.loads((run / "gap" / "gap.json").read_text())["effects"]}
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=program, capture_output=True, text=True, check=True)
+    return {"commit": commit.stdout.strip(), **found}
 
 
 def help_seconds() -> float:
@@ -118,21 +144,27 @@ def results(out: Path) -> dict[str, Any]:
 
 def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
-    name = stem("default_run", arguments.quick)
-    lines = list[Line]()
+    name, quick = stem("default_run", arguments.quick), arguments.quick
+    out, other = arguments.out / name, arguments.against
+    paired = dict[str, Any]()
+    if other is not None:
+        paired["against"] = of_another_commit(other, out, quick)
     with tempfile.TemporaryDirectory() as cache:
-        for line in command_lines(arguments.out / name, cache):
-            print(line.text, flush=True)
-            lines.append(line)
-            if arguments.quick and PROGRESS.match(line.text):
-                break
+        lines = shown(command_lines(out, cache), quick)
+        if other is not None:
+            with tempfile.TemporaryDirectory() as folder:
+                paired["warm"] = figures(shown(command_lines(Path(folder) / name, cache), quick))
     found = {"help_s": help_seconds(), **figures(lines)}
-    result = found if arguments.quick else {**found, **results(arguments.out / name)}
+    if other is not None and not quick:
+        before = paired["against"]["whole_minutes"]
+        paired["ratio_cold"] = found["whole_minutes"] / before
+        paired["ratio_warm"] = paired["warm"]["whole_minutes"] / before
+    result = {**found, **paired} if quick else {**found, **paired, **results(out)}
     import tuned  # noqa: F401  (before jax starts: the run had all cores)
 
     printed = [[round(line.seconds, 1), line.text] for line in lines]
     write_json(arguments.out / f"{name}.json", {**result, "printed": printed, **origin(0)})
-    print(json.dumps({k: result[k] for k in result if k not in ("torque_gap", "sentence")}))
+    print(json.dumps({k: result[k] for k in result if k not in ("torque_distances", "sentence")}))
 
 
 if __name__ == "__main__":
