@@ -2,7 +2,7 @@
 
     python benchmarks/robustness.py [--quick] [--out DIR] [--only WORD ...]
 
-Mutations of every kind of file that the program reads back (tests/fuzz/file_kinds.py) and every public function with
+Mutations of every kind of file that the program reads back (tests/fuzz/run_kinds.py) and every public function with
 every wrong argument (tests/fuzz/api_calls.py), in worker processes that a watchdog ends.  An input is either accepted,
 and then what was read is of use, or refused by a ValueError or an OSError whose message is one line that names it.  A
 run that was stopped goes on; what was found lies in runs/robustness.  Kills of whole runs are benchmarks/kills.py's:
@@ -40,8 +40,8 @@ import tuned  # noqa: F401  (before jax starts)
 # isort: split
 
 import api_calls
-import file_kinds
 import kinds
+import run_kinds
 import tyro
 from outcome import MOST_SECONDS, Outcome
 
@@ -126,7 +126,7 @@ def main(arguments: Arguments) -> None:
 def cases(arguments: Arguments) -> Iterator[Case]:
     """Which cases there are, those of all kinds by turns."""
     share = 100 if arguments.quick else 1
-    tried = file_kinds.KINDS.values()
+    tried = run_kinds.EVERY.values()
     whole = sum(kind.weight for kind in tried)
     counts = {kind.name: max(3, round(arguments.files * kind.weight / whole / share)) for kind in tried}
     counts[ARGUMENTS] = max(3, arguments.arguments // share)
@@ -282,7 +282,7 @@ class Bench:
         if name == ARGUMENTS:
             call, argument, wrong = random.choice(self.wrong)
             return api_calls.attempt(self.calls[call], argument, wrong, random if random.random() < SEVERAL else None)
-        kind, valid = file_kinds.KINDS[name], self.valid[name]
+        kind, valid = run_kinds.EVERY[name], self.valid[name]
         return kinds.attempt(kind, valid, self.folder / "input", random, most=self.most(name))
 
     def most(self, name: str) -> float:
@@ -292,7 +292,7 @@ class Bench:
     def prepare(self, name: str) -> None:
         """Make a kind's valid example, where it is not there yet."""
         if name != ARGUMENTS and name not in self.valid:
-            self.valid[name] = self._made(file_kinds.KINDS[name])
+            self.valid[name] = self._made(run_kinds.EVERY[name])
 
     def _made(self, kind: kinds.Kind) -> Path:
         """A folder with the valid example; RuntimeError where that is not accepted."""

@@ -10,6 +10,7 @@ from droid_jax.arguments import check_fields, instance, number, one_of, optional
 from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.identifiability import IdentifiabilityConfig
+from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import CmaConfig
 from droid_jax.simulate.windows import WindowConfig
@@ -141,6 +142,7 @@ class DiscrepancyConfig:
         search: of the base fit.
         refine: of the base fit.
         refit: of every extended model.
+        one_step: of the one step that candidates get.
         polish: of the selected model, with slopes over the width of its posterior: its intervals are reported.
         one_step_fits: candidates that get one Levenberg-Marquardt step in each selection step.
         full_refits: the best of these, refitted in full.
@@ -165,6 +167,9 @@ class DiscrepancyConfig:
     search: CmaConfig = field(default_factory=lambda: CmaConfig(parents=None, generations=20))
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=CONVERGE_ITERATIONS))
     refit: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0))
+    one_step: LevenbergMarquardtConfig = field(
+        default_factory=lambda: LevenbergMarquardtConfig(dampings=(1e-2, 1e0, 1e1, 1e3), lengths=(1.0,))
+    )
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
     one_step_fits: int = 12
     full_refits: int = 6
@@ -186,6 +191,7 @@ class DiscrepancyConfig:
             **dict.fromkeys(("one_step_fits", "full_refits", "pair_refits", "max_effects"), partial(whole, least=1)),
             **dict.fromkeys(("refine", "refit", "polish"), partial(instance, kind=RefineConfig)),
             search=partial(instance, kind=CmaConfig),
+            one_step=partial(instance, kind=LevenbergMarquardtConfig),
             budget_minutes=optional(partial(number, least=0)),
             selection=partial(instance, kind=SelectionConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),

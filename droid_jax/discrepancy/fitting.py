@@ -22,7 +22,7 @@ from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import moved_by_step, posterior_of, step_shift
 from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, principal_axes
-from droid_jax.identify.multistart import Hypotheses, RefineConfig, Refined, RefineProgress, chord, refine
+from droid_jax.identify.multistart import Hypotheses, Look, RefineConfig, Refined, RefineProgress, chords, refine
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
@@ -108,42 +108,48 @@ def refit(
     return FittedModel(tuple(parts), values, space, refined, left, rows.discrepancy(left))
 
 
-def one_step_fit(
+def one_step_fits(
     residual_set: ResidualSet,
     model: FittedModel,
-    part: Candidate,
-    sensitivities: Mapping[str, np.ndarray],
-    proposed: np.ndarray,
+    asked: Sequence[tuple[Candidate, Mapping[str, np.ndarray], np.ndarray]],
     config: LevenbergMarquardtConfig | None = None,
-) -> tuple[np.ndarray, float]:
-    """A model with one more effect after one step, with slopes that are known already: values [D], objective.
+) -> list[tuple[np.ndarray, float]]:
+    """A model with one more effect after one step, with slopes that are known already: values [D] and objective of each
+    effect, all in the same batches.
 
-    It begins at the proposed values and without the effect, and the better end counts: a step takes parameters two
+    A step begins at the proposed values and without the effect, and the better end counts: it takes parameters two
     prior deviations at most, and a strong effect is many.
 
     Args:
         residual_set: of the fitted recording.
-        model: without the effect.
-        part: the effect.
-        sensitivities: coefficient -> [M] what a unit of it adds to the simulation at `model`, in one repeat's noise.
-        proposed: [D] the model with the effect's coefficients at their linear best.
-        config: of the step.
+        model: without the effects.
+        asked: effects; of each what a unit of a coefficient adds to the simulation at `model`, [M] in one repeat's
+            noise, and values [D]: the model with the effect's coefficients at their linear best.
+        config: of the steps.
     """
     whole = residual_set.cost.space
-    space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
-    jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
-    jacobian[:, space.columns(model.space)] = model.refined.jacobian
-    for name in part.coefficients:
-        jacobian[:, space.index(name)] = sensitivities[name] * space[name].std * np.sqrt(residual_set.repeats)
-    without, coefficients = proposed.copy(), [whole.index(name) for name in part.coefficients]
-    without[coefficients] = model.values[coefficients]
+    looks, rest = list[Look](), list[np.ndarray]()
+    for part, sensitivities, proposed in asked:
+        space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
+        jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
+        jacobian[:, space.columns(model.space)] = model.refined.jacobian
+        for name in part.coefficients:
+            jacobian[:, space.index(name)] = sensitivities[name] * space[name].std * np.sqrt(residual_set.repeats)
+        without, coefficients = proposed.copy(), [whole.index(name) for name in part.coefficients]
+        without[coefficients] = model.values[coefficients]
+        starts = np.stack([without, proposed])[:, whole.columns(space)]
+        looks.append(Look(space, starts, jacobian, functools.partial(_over, whole, space, without)))
+        rest.append(without)
+    ended = chords(residual_set.whitened, looks, config)
+    each = zip(looks, rest, ended, strict=True)
+    return [
+        (whole.embed(look.space, values[None], without)[0], objective) for look, without, (values, objective) in each
+    ]
 
-    def residuals(rows: np.ndarray) -> np.ndarray:
-        return residual_set.whitened(whole.embed(space, rows, without))
 
-    starts = np.stack([without, proposed])[:, whole.columns(space)]
-    values, objective = chord(residuals, space, starts, jacobian, config)
-    return whole.embed(space, values[None], without)[0], objective
+def _over(whole: Space, space: Space, rest: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """[P, W] over a whole space of rows [P, D] over a part of it, the rest as in `rest` [W]."""
+    return whole.embed(space, rows, rest)
 
 
 def base_fit(

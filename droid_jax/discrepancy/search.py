@@ -27,7 +27,7 @@ from droid_jax.discrepancy.config import CONVERGE_ITERATIONS
 from droid_jax.discrepancy.fitting import (
     FittedModel,
     fitted_from_prior,
-    one_step_fit,
+    one_step_fits,
     refit,
     remaining_discrepancy,
     remaining_residuals,
@@ -49,6 +49,7 @@ from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates, names_of
 
+TOGETHER = 4  # candidates whose first steps share batches: two starts of eight trials each fill two blocks of a CPU
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 
 
@@ -212,17 +213,21 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
 def _one_step_fits(
     problem: Problem, model: FittedModel, ranked: Sequence[Proposal], found: ScoreTest
 ) -> tuple[list[tuple[np.ndarray, float, Proposal]], Notes]:
-    """Values [D] and objective of each proposal after one step (see `fitting.one_step_fit`)."""
-    out = []
-    for number, proposal in enumerate(ranked):
-        if number and problem.late:
-            return out, _late(len(ranked) - number, len(ranked), "candidates not looked at")
-        (part,), start = proposal.parts, proposal.start(problem.case.full_space, model.values)
-        problem.progress("one_step_fit", names_of((*model.keys, part.key)))
-        rows = {d.coefficient: k for k, d in enumerate(found.directions) if d.candidate.shaped_key == part.shaped_key}
-        raw = {a: found.raw[k] for a, k in rows.items()}
-        config = problem.case.config.refit
-        out.append((*one_step_fit(problem.case.train, model, part, raw, start, config), proposal))
+    """Values [D] and objective of each proposal after one step (see `fitting.one_step_fits`), some at a time."""
+    out, config = list[tuple[np.ndarray, float, Proposal]](), problem.case.config
+    for first in range(0, len(ranked), TOGETHER):
+        if first and problem.late:
+            return out, _late(len(ranked) - first, len(ranked), "candidates not looked at")
+        asked, some = [], ranked[first : first + TOGETHER]
+        for proposal in some:
+            (part,), start = proposal.parts, proposal.start(problem.case.full_space, model.values)
+            problem.progress("one_step_fit", names_of((*model.keys, part.key)))
+            same = {
+                d.coefficient: k for k, d in enumerate(found.directions) if d.candidate.shaped_key == part.shaped_key
+            }
+            asked.append((part, {a: found.raw[k] for a, k in same.items()}, start))
+        ended = one_step_fits(problem.case.train, model, asked, config.one_step)
+        out += [(*end, proposal) for end, proposal in zip(ended, some, strict=True)]
     return out, Notes()
 
 

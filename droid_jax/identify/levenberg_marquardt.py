@@ -101,6 +101,13 @@ def penalised(x: np.ndarray, residual: np.ndarray, prior: np.ndarray) -> np.ndar
     return np.where(np.isfinite(value), value, np.inf)
 
 
+def whole_rows(residual: np.ndarray) -> np.ndarray:
+    """Residuals [P, M] in double precision, NaN throughout a row where a replay failed; of several recordings one may
+    have."""
+    residual = np.asarray(residual, dtype=np.float64)
+    return np.where(np.isfinite(residual).all(axis=1, keepdims=True), residual, np.nan)
+
+
 def off_bounds(x: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """[D] bool, coordinates that a step down the slope [D] does not push over a bound that they sit on."""
     return ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))
@@ -162,9 +169,7 @@ class DampedProblem:
     def replay(self, x: np.ndarray) -> np.ndarray:
         """[P, D] -> residuals [P, M]; NaN throughout where a replay failed."""
         self.evaluations += len(x)
-        residual = np.asarray(self.residuals(self.space.from_search(x)), dtype=np.float64)
-        whole = np.isfinite(residual).all(axis=1, keepdims=True)  # of one recording of several it may not be
-        return np.where(whole, residual, np.nan)
+        return whole_rows(self.residuals(self.space.from_search(x)))
 
     def differences(self, up: np.ndarray, down: np.ndarray, state: Starts) -> tuple[np.ndarray, np.ndarray]:
         """Spans [S, N, D] and residual differences [S, N, M] between up and down, both [S, N, D].
@@ -189,7 +194,10 @@ class DampedProblem:
 
     def start(self, x: np.ndarray) -> Starts:
         """The state of fresh starts [S, D]."""
-        residual = self.replay(x)
+        return self.begun(x, self.replay(x))
+
+    def begun(self, x: np.ndarray, residual: np.ndarray) -> Starts:
+        """The state of fresh starts [S, D] with residuals [S, M]."""
         widths = np.full(x.shape, self._config.step)
         return Starts(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
 
@@ -198,7 +206,7 @@ class DampedProblem:
         widths = np.full(x.shape, self._config.step)
         up, down = self._around(x, widths)
         residual = self.replay(np.concatenate([x, up[0], down[0]]))
-        state = Starts(x, residual[:1], self.objective(x, residual[:1]), np.full(1, 1e-3), widths)
+        state = self.begun(x, residual[:1])
         return state, self._slopes(
             *self._apart(np.stack([up, down]), residual[1:].reshape(2, *up.shape[:2], -1), state)
         )
@@ -218,9 +226,10 @@ class DampedProblem:
     def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
         """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
         for _ in range(self._config.chords):
-            last = state.objective
-            state = self._try(state, jacobian, held)
-            if np.all(fall(last, state.objective) <= self._config.chord * state.objective):
+            last, trials = state, self.trials(state, jacobian, held)
+            residual = self.replay(trials.reshape(-1, trials.shape[-1])).reshape(*trials.shape[:2], -1)
+            state = self.taken(state, trials, residual)
+            if not self.paid(last, state):
                 break
         return state
 
@@ -261,15 +270,16 @@ class DampedProblem:
             jacobian = np.linalg.lstsq(spans[0], apart[0])[0].T
         return jacobian
 
-    def _try(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None) -> Starts:
-        """All trials of all starts in one batch; each start takes its best, or stays."""
-        starts, dims = state.x.shape
-        steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(starts)])
+    def trials(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> np.ndarray:
+        """[S, N, D] the trials of all starts: every damping and length, on both paths."""
+        steps = np.stack([self._steps(state.rows([s]), jacobian[s], held, s) for s in range(len(state.x))])
         paths = [self.inside(state.x[:, None] + steps), self.inside(self._straight(state.x[:, None], steps))]
-        trials = np.concatenate(paths, axis=1)
-        residual = self.replay(trials.reshape(-1, dims)).reshape(*trials.shape[:2], -1)
+        return np.concatenate(paths, axis=1)
+
+    def taken(self, state: Starts, trials: np.ndarray, residual: np.ndarray) -> Starts:
+        """Each start at its best trial, or where it was; residual: [S, N, M] of the trials."""
         objective = self.objective(trials, residual)
-        rows, pick = np.arange(starts), np.argmin(objective, axis=1)
+        rows, pick = np.arange(len(state.x)), np.argmin(objective, axis=1)
         better = objective[rows, pick] < state.objective
         factor = np.tile(np.repeat(self._config.dampings, len(self._config.lengths)), PATHS)[pick]
         return Starts(
@@ -279,6 +289,10 @@ class DampedProblem:
             damping=np.clip(np.where(better, state.damping * factor, state.damping), 1e-8, 1e4),
             widths=state.widths,
         )
+
+    def paid(self, before: Starts, after: Starts) -> bool:
+        """Whether a batch of trials lowered the objective of some start enough for another one with its Jacobian."""
+        return bool(np.any(fall(before.objective, after.objective) > self._config.chord * after.objective))
 
     def _steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None, row: int) -> np.ndarray:
         """[dampings * lengths, D] Levenberg-Marquardt steps of one start, along the bounds it sits on.

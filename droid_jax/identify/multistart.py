@@ -26,6 +26,7 @@ from droid_jax.identify.levenberg_marquardt import (
     Starts,
     curvature,
     fall,
+    whole_rows,
 )
 from droid_jax.identify.search import CmaConfig, NotReplayed, cma_search
 from droid_jax.model.parameters import Parameter, Space
@@ -60,6 +61,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     basin_hop_longest: largest component of that step, search units: what the data do not tell is not searched far.
     basin_hop_tolerance: a hop that lowers the objective by less than this ends the refinement,
     basin_hop_excess_tolerance: or by less than this share of what it is above that of noise alone.
+    basin_hop_misfit: residuals' mean square above which there is no hop: that is no small step away from a fit.
     reset_distance: search units; a parameter of interest that strayed further from its initial mean is put back once,
     reset_deviation: where its posterior deviation is above this, search units.
     """
@@ -82,6 +84,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     basin_hop_longest: float = 1.0
     basin_hop_tolerance: float = 2.0
     basin_hop_excess_tolerance: float = 4e-3
+    basin_hop_misfit: float = 2.0
     reset_distance: float = 1.0
     reset_deviation: float = 0.05
 
@@ -101,6 +104,7 @@ class RefineConfig(LevenbergMarquardtConfig):
             target_objective=partial(arguments.number, infinite=True),
             pruning_ratio=several(partial(arguments.number, least=1)),
             misfit_threshold=partial(arguments.number, least=0),
+            basin_hop_misfit=partial(arguments.number, above=0, infinite=True),
             hold_iterations=partial(whole, least=0),
             patience=partial(whole, least=1),
             basin_hops=partial(whole, least=0),
@@ -209,22 +213,52 @@ def refine(
     )
 
 
-def chord(
-    residuals: Residuals,
-    space: Space,
-    starts: np.ndarray,
-    jacobian: np.ndarray,
-    config: LevenbergMarquardtConfig | None = None,
-) -> tuple[np.ndarray, float]:
-    """What steps with a Jacobian [M, D] known from elsewhere reach from the best start [S, D]: values [D], objective.
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A first look at what a refinement would find.
 
-    A few batches of trials and no differences: a first look at what a refinement would find.
+    space: of what is free; starts: [S, D] in it; jacobian: [M, D] known from elsewhere; rows: values [P, D] -> what the
+    batch of replays takes, [P, W].
     """
-    problem = DampedProblem(residuals, space, config or LevenbergMarquardtConfig())
-    state = problem.start(problem.inside(space.to_search(space.check(starts))))
-    state = problem.candidate_steps(state, np.repeat(jacobian[None], len(state.x), axis=0))
-    best = int(np.argmin(state.objective))
-    return space.from_search(state.x[best]), float(state.objective[best])
+
+    space: Space
+    starts: np.ndarray
+    jacobian: np.ndarray
+    rows: Callable[[np.ndarray], np.ndarray]
+
+
+def chords(
+    residuals: Residuals, looks: Sequence[Look], config: LevenbergMarquardtConfig | None = None
+) -> list[tuple[np.ndarray, float]]:
+    """What steps with known Jacobians reach: of each look values [D] and objective of its best start.
+
+    A few batches of trials, of all looks at once, and no differences.
+    """
+    config = config or LevenbergMarquardtConfig()
+    problems = [DampedProblem(residuals, look.space, config) for look in looks]
+
+    def replayed(points: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+        """Search coordinates [..., D] of some looks -> residuals [..., M], of one batch."""
+        rows = [looks[k].rows(looks[k].space.from_search(x.reshape(-1, x.shape[-1]))) for k, x in points.items()]
+        parts = np.split(whole_rows(residuals(np.concatenate(rows))), np.cumsum([len(r) for r in rows])[:-1])
+        return {k: part.reshape(*x.shape[:-1], -1) for (k, x), part in zip(points.items(), parts, strict=True)}
+
+    begin = {
+        k: problem.inside(look.space.to_search(look.space.check(look.starts)))
+        for k, (problem, look) in enumerate(zip(problems, looks, strict=True))
+    }
+    states = {k: problems[k].begun(begin[k], residual) for k, residual in replayed(begin).items()}
+    slopes = {k: np.repeat(look.jacobian[None], len(begin[k]), axis=0) for k, look in enumerate(looks)}
+    going = list(states)
+    for _ in range(config.chords):
+        trials = {k: problems[k].trials(states[k], slopes[k]) for k in going}
+        after = {k: problems[k].taken(states[k], trials[k], residual) for k, residual in replayed(trials).items()}
+        going = [k for k in going if problems[k].paid(states[k], after[k])]
+        states |= after
+        if not going:
+            break
+    best = [states[k].rows(int(np.argmin(states[k].objective))) for k in range(len(looks))]
+    return [(look.space.from_search(end.x), float(end.objective)) for look, end in zip(looks, best, strict=True)]
 
 
 class _Descent(DampedProblem):
@@ -304,10 +338,13 @@ class _Descent(DampedProblem):
     def hopped(self, state: Starts) -> tuple[Starts, np.ndarray | None, bool]:
         """Leave small basins, as often as that pays and no more than `hops` times; one start.
 
-        Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more.
+        Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more, or none
+        was to be made.
         """
         settled, slopes = self.config.basin_hops == 0, None
         for number in range(self.config.basin_hops):
+            if np.mean(state.residual**2) > self.config.basin_hop_misfit:
+                return state, slopes, True
             slopes = self.jacobian(state)[0]
             hopped = self.hop(state, slopes, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]

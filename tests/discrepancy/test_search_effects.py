@@ -155,10 +155,10 @@ def test_the_significance_is_configured(found: Small):
     assert info is not None and info.score_test.p == pytest.approx(1 / 128) and info.tried == () and ended.exhausted
 
 
-def test_a_search_without_time_tries_one_candidate_and_says_what_it_left_out(found: Small):
+def test_a_search_without_time_refits_one_candidate_and_says_what_it_left_out(found: Small):
     state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
-    assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
+    assert state.notes.not_tried[0] == "2 of 3 candidates not refitted" and state.notes.failed == ()
     case = replace(found.case, config=replace(found.case.config, budget_minutes=0.0))
     verdict = search_effects(case, found.base, FLOOR)
     assert verdict.not_tried == state.notes.not_tried and verdict.effects == (PRELOAD,)
@@ -302,7 +302,11 @@ def late_bomb(scene: Scene) -> Effect:
 @pytest.mark.slow
 def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
     """The score test's small step is replayed, the proposal is not."""
-    monkeypatch.setattr(search, "one_step_fit", lambda train, model, part, raw, proposed: (proposed, -np.inf))
+
+    def unmoved(train: Any, model: Any, asked: Any, config: Any) -> list[tuple[np.ndarray, float]]:
+        return [(proposed, -np.inf) for *_, proposed in asked]
+
+    monkeypatch.setattr(search, "one_step_fits", unmoved)
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, (late_bomb(scene),)))
     assert verdict.score_tests[0].failed == () and verdict.score_tests[0].explained[0] > 0.5

@@ -46,6 +46,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "benchmarks/distributed.py": (),
     "benchmarks/gpu.py": (),
     "benchmarks/scaling.py": (),
+    "benchmarks/stage_profile.py": (),
     "benchmarks/default_run.py": (),
     "benchmarks/durations.py": (),
     "benchmarks/excitation.py": (),

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import model_kinds
 import numpy as np
+import recording_kinds
 from kinds import ROOT, Kind, use
 from markupsafe import Markup
 from recording_kinds import recording
@@ -254,3 +256,6 @@ KINDS = (
     Kind("checkpoints", "**/*", make_checkpoints, use_checkpoints, 1.5),
     Kind("kept replays", "*.npz", make_replays, use_replays, 2),
 )
+
+# Every kind of file that the program reads back, by name.  A user's file of effects is code, and is none of them.
+EVERY: dict[str, Kind] = {kind.name: kind for kind in (*recording_kinds.KINDS, *model_kinds.KINDS, *KINDS)}

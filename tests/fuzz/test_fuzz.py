@@ -14,8 +14,8 @@ from pathlib import Path
 from random import Random
 
 import api_calls
-import file_kinds
 import pytest
+import run_kinds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from kinds import Kind, attempt, attempt_valid
@@ -52,14 +52,14 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Kind], Path]:
     return folder
 
 
-QUICK = [name for name, kind in file_kinds.KINDS.items() if not kind.drawn]
+QUICK = [name for name, kind in run_kinds.EVERY.items() if not kind.drawn]
 
 
 @pytest.mark.parametrize("name", QUICK)
 def test_a_damaged_file_is_refused_in_a_sentence_or_is_of_use(
     name: str, valid: Callable[[Kind], Path], tmp_path: Path
 ) -> None:
-    kind = file_kinds.KINDS[name]
+    kind = run_kinds.EVERY[name]
     outcome = attempt_valid(kind, valid(kind), tmp_path / "input")
     assert outcome.result == "accepted", outcome
 

@@ -1,12 +1,13 @@
 """The refinement on residual functions in numpy whose optimum is known in closed form."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
 
 from droid_jax.identify.levenberg_marquardt import DampedProblem
-from droid_jax.identify.multistart import RefineConfig, chord, refine
+from droid_jax.identify.multistart import Look, RefineConfig, chords, refine
 from droid_jax.model.parameters import Parameter, Scaling, Space
 
 
@@ -246,10 +247,22 @@ def test_hops_get_past_steps_beside_the_optimum_that_no_derivative_sees():
     stuck = refine(stepped, space, [-1.0, 1.0], config)
     np.testing.assert_allclose(stuck.best, [0.7, -0.4], atol=1e-3)
     assert stuck.objective == pytest.approx(14.0, abs=1e-3)
-    hopped = refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, basin_hops=4))
+    hopping = dataclasses.replace(config, basin_hops=4, basin_hop_misfit=np.inf)
+    hopped = refine(stepped, space, [-1.0, 1.0], hopping)
     assert 1.44 <= hopped.objective < 1.44 + 0.2
     np.testing.assert_allclose(hopped.best, [1.9, -1.6], atol=0.1)
     assert hopped.converged
+
+
+def test_a_model_that_is_far_from_the_data_is_left_where_it_stands():
+    """Mean square residuals there are about ten."""
+    space, config = Space((line("a"), line("b"))), dataclasses.replace(FLAT, tolerance=0.5, basin_hop_misfit=3.0)
+    stood, hopping = (
+        refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, basin_hops=hops)) for hops in (0, 4)
+    )
+    assert np.mean(stood.residual**2) > 3.0
+    np.testing.assert_array_equal(hopping.best, stood.best)
+    assert hopping.converged
 
 
 def test_a_hop_that_finds_nothing_is_the_last():
@@ -375,8 +388,14 @@ def test_a_start_that_fails_on_all_the_data_is_refused():
         refine(lambda v: np.full((len(v), 3), np.nan), BASINS, [3.2, 14.0], FLAT, first=two_basins)
 
 
+def first_look(residuals, space, starts, slopes, config=None):
+    """One look by itself, over the space that it frees."""
+    (found,) = chords(residuals, [Look(space, np.array(starts), slopes, lambda rows: rows)], config)
+    return found
+
+
 def test_a_first_look_from_where_nothing_can_be_replayed_stays_there():
-    values, objective = chord(lambda v: np.full((len(v), 2), np.nan), BASINS, np.array([[1.0, 2.0]]), np.eye(2))
+    values, objective = first_look(lambda v: np.full((len(v), 2), np.nan), BASINS, [[1.0, 2.0]], np.eye(2))
     np.testing.assert_allclose(values, [1.0, 2.0])
     assert np.isinf(objective)
 
@@ -384,23 +403,42 @@ def test_a_first_look_from_where_nothing_can_be_replayed_stays_there():
 def test_a_first_look_begins_at_the_best_of_its_starts():
     """Steps of two units at most lead no further than a few from the first; the second is nearly there."""
     space, slopes = Space((line("a"),)), np.ones((1, 1))
-    far, _ = chord(linear(slopes, [40.0]), space, np.array([[0.0]]), slopes)
+    far, _ = first_look(linear(slopes, [40.0]), space, [[0.0]], slopes)
     assert 0.0 < far[0] < 10.0
-    values, objective = chord(linear(slopes, [40.0]), space, np.array([[0.0], [39.0]]), slopes)
+    values, objective = first_look(linear(slopes, [40.0]), space, [[0.0], [39.0]], slopes)
     assert values[0] == pytest.approx(40.0 / (1 + 1 / 16), abs=0.01)  # the prior is four deviations wide
     assert objective == pytest.approx(0.5 * 40.0**2 / 17, rel=1e-4)
 
 
 def test_a_first_look_tries_what_its_settings_say():
-    seen = list[int]()
-
-    def counted(values: np.ndarray) -> np.ndarray:
-        seen.append(len(values))
-        return linear(np.ones((1, 1)), [40.0])(values)
-
+    recorder = Recorder(linear(np.ones((1, 1)), [40.0]))
     few = RefineConfig(dampings=(1e-2, 1e1, 1e3), lengths=(1.0,), chords=1)
-    chord(counted, Space((line("a"),)), np.array([[0.0]]), np.ones((1, 1)), few)
-    assert seen == [1, few.trials] and few.trials == 6
+    first_look(recorder, Space((line("a"),)), [[0.0]], np.ones((1, 1)), few)
+    assert [len(rows) for rows in recorder.asked] == [1, few.trials] and few.trials == 6
+
+
+def test_first_looks_share_their_batches_and_each_ends_as_by_itself():
+    """Each frees one of two parameters; one that no longer pays asks for no further trials."""
+    matrix, frees = np.array([[3.0, 1.0], [1.0, 2.0], [1.0, -1.0]]), (0, 1)
+    recorder = Recorder(lambda v: 10.0 * np.arctan(0.1 * (v @ matrix.T - [30.0, 20.0, 5.0])))
+    looks = [
+        Look(Space((line(name),)), np.array([[0.0], [1.0]]), matrix[:, [k]], partial(with_zero, k))
+        for k, name in zip(frees, "ab", strict=True)
+    ]
+    together, batches = chords(recorder, looks), [len(rows) for rows in recorder.asked]
+    for look, found in zip(looks, together, strict=True):
+        alone = chords(recorder, [look])[0]
+        np.testing.assert_allclose(found[0], alone[0])
+        assert found[1] == pytest.approx(alone[1])
+    trials = RefineConfig().trials
+    assert batches[:2] == [4, 4 * trials] and set(batches[2:]) <= {4 * trials, 2 * trials}
+
+
+def with_zero(column: int, rows: np.ndarray) -> np.ndarray:
+    """[P, 2] rows [P, 1] of one parameter, the other at zero."""
+    whole = np.zeros((len(rows), 2))
+    whole[:, [column]] = rows
+    return whole
 
 
 def test_a_trial_that_fails_is_not_taken():
