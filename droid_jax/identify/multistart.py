@@ -61,14 +61,15 @@ class RefineConfig(LevenbergMarquardtConfig):
     basin_hop_longest: largest component of that step, search units: what the data do not tell is not searched far.
     basin_hop_tolerance: a hop that lowers the objective by less than this ends the refinement,
     basin_hop_excess_tolerance: or by less than this share of what it is above that of noise alone.
-    basin_hop_misfit: residuals' mean square above which there is no hop: that is no small step away from a fit.
+    basin_hop_misfit: residuals' mean square above which there is neither a hop nor anything put back: a model that
+      misses something is no small step away from a fit.
     reset_distance: search units; a parameter of interest that strayed further from its initial mean is put back once,
     reset_deviation: where its posterior deviation is above this, search units.
     """
 
     iterations: int = 30
     tolerance: float = 0.5
-    excess_tolerance: float = 2e-3
+    excess_tolerance: float = 1e-2
     patience: int = 1
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
@@ -195,7 +196,7 @@ def refine(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
     state, _ = problem.descend(state)
-    if config.basin_hops:
+    if config.basin_hops and not problem.misses(state):
         state = problem.back(state)
     state, slopes, settled = problem.hopped(state)
     return Refined(
@@ -322,6 +323,10 @@ class _Descent(DampedProblem):
             state, _ = self.descend(found)
         return state
 
+    def misses(self, state: Starts) -> bool:
+        """Whether the leader is so far from the data that the model must lack something."""
+        return bool(np.mean(state.residual[0] ** 2) > self.config.basin_hop_misfit)
+
     def least(self, state: Starts) -> float:
         """By how much the best objective must fall for it to be worth an iteration."""
         leader = int(np.argmin(state.objective))
@@ -343,7 +348,7 @@ class _Descent(DampedProblem):
         """
         settled, slopes = self.config.basin_hops == 0, None
         for number in range(self.config.basin_hops):
-            if np.mean(state.residual**2) > self.config.basin_hop_misfit:
+            if self.misses(state):
                 return state, slopes, True
             slopes = self.jacobian(state)[0]
             hopped = self.hop(state, slopes, number)

@@ -13,7 +13,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from droid_jax.arguments import check_fields, number, optional
+from droid_jax.arguments import check_fields, number, optional, whole
 from droid_jax.model.actuators import drives_joint, has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording
@@ -35,8 +35,8 @@ class WindowConfig:
     history: s, of commands before the lead-in; the longest delay that it can know.
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
     every: s, in each of which one window lies, at a place that differs; None: none is left out.
-    longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them windows
-      that take as long to replay stand for them, spread over them:
+    longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them
+    samples: windows or so are replayed instead, spread over them,
     sample_length, sample_lead: s, of each.
     """
 
@@ -46,7 +46,8 @@ class WindowConfig:
     reach: float = 0.06
     every: float | None = None
     longest: float = 120.0
-    sample_length: float = 4.0
+    samples: int = 24
+    sample_length: float = 1.5
     sample_lead: float = 0.5
 
     def __post_init__(self) -> None:
@@ -56,11 +57,12 @@ class WindowConfig:
             **dict.fromkeys(("length", "reach", "longest", "sample_length"), above),
             **dict.fromkeys(("lead", "history", "sample_lead"), least),
             every=optional(above),
+            samples=partial(whole, least=1),
         )
 
     def sampled(self, seconds: float) -> WindowConfig:
-        """Of motions of so many seconds in all: longer windows, spread over them, `longest` to be replayed."""
-        every = max(self.sample_length, seconds * (self.sample_length + self.sample_lead) / self.longest)
+        """Of motions of so many seconds in all: a number of longer windows, spread over them."""
+        every = max(self.sample_length, seconds / self.samples)
         return replace(self, length=self.sample_length, lead=self.sample_lead, every=every)
 
 

@@ -98,8 +98,8 @@ def test_windows_need_every_joint():
 
 
 def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases():
-    config = WindowConfig(longest=120.0, sample_length=4.0, sample_lead=0.5).sampled(480.0)
-    assert config.every == pytest.approx(4 * 4.5) and config.length == config.sample_length
+    config = WindowConfig().sampled(480.0)
+    assert config.every == 480.0 / config.samples and config.length == config.sample_length
     assert WindowConfig().sampled(10.0).every == config.sample_length  # a short one is not thinned out
     last, least, every = 12000, 350, 600.0
     places = _spread(last, least, every)
@@ -143,7 +143,7 @@ def test_long_motions_of_held_joints_are_sampled(
         raise Caught(whole, given[4].every)
 
     monkeypatch.setattr(log_case, "windowed_log", catch)
-    windows = WindowConfig(longest=longest, sample_length=0.4, sample_lead=0.2)
+    windows = WindowConfig(longest=longest, samples=5, sample_length=0.4)
     config = DiscrepancyConfig(channels=("position",), replay=replay, windows=windows)
     train, test = [swung("a", 1.0, 0.7), swung("b", 1.0, 0.9)], [swung("c", 1.0, 0.5)]
     with pytest.raises(Caught) as caught:
