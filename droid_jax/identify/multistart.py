@@ -69,7 +69,7 @@ class RefineConfig(LevenbergMarquardtConfig):
 
     iterations: int = 30
     tolerance: float = 0.5
-    excess_tolerance: float = 1e-2
+    excess_tolerance: float = 2e-3
     patience: int = 1
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
