@@ -325,7 +325,8 @@ class _Descent(DampedProblem):
 
     def misses(self, state: Starts) -> bool:
         """Whether the leader is so far from the data that the model must lack something."""
-        return bool(np.mean(state.residual[0] ** 2) > self.config.basin_hop_misfit)
+        left: np.ndarray = state.residual[0]
+        return float(left @ left) > self.config.basin_hop_misfit * len(left)
 
     def least(self, state: Starts) -> float:
         """By how much the best objective must fall for it to be worth an iteration."""
