@@ -29,6 +29,7 @@ import tempfile  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import empty_cache, origin, stem  # noqa: E402
+from droid_jax import runtime  # noqa: E402
 from droid_jax.files import TRANSFER  # noqa: E402
 from droid_jax.report.gap_folder import read_answer  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
@@ -98,8 +99,7 @@ def of_another_commit(program: Path, out: Path, quick: bool) -> dict[str, Any]:
         found: dict[str, Any] = figures(shown(command_lines(run, f"{folder}/cache", program), quick))
         if not quick:
             found |= {"effects": json.loads((run / "gap" / "gap.json").read_text())["effects"]}
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=program, capture_output=True, text=True, check=True)
-    return {"commit": commit.stdout.strip(), **found}
+    return {"commit": runtime.git_commit(program), **found}
 
 
 def help_seconds() -> float:

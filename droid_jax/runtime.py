@@ -136,7 +136,7 @@ def versions() -> dict[str, str]:
     for name in ("droid_jax", *PACKAGES):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-    commit = _git_commit(Path(__file__).resolve().parents[1])
+    commit = git_commit(Path(__file__).resolve().parents[1])
     if commit:
         found["git"] = commit
     return found
@@ -361,7 +361,7 @@ def _processor_key() -> str:
     return hashlib.sha256(features.encode()).hexdigest()[:12]
 
 
-def _git_commit(checkout: Path) -> str | None:
+def git_commit(checkout: Path) -> str | None:
     """Commit of a checkout; None for an installed package or where git is missing."""
     if not (checkout / ".git").exists():
         return None

@@ -202,7 +202,7 @@ def test_versions_name_what_is_installed():
 
 
 def test_git_commit_of_a_checkout(tmp_path):
-    assert runtime._git_commit(tmp_path) is None
+    assert runtime.git_commit(tmp_path) is None
 
     def git(*arguments: str) -> str:
         who = ("-c", "user.name=n", "-c", "user.email=n@example.org", "-c", "commit.gpgsign=false")
@@ -213,19 +213,19 @@ def test_git_commit_of_a_checkout(tmp_path):
         git("init", "--quiet")
     except FileNotFoundError:
         pytest.skip("git is not installed")
-    assert runtime._git_commit(tmp_path) is None  # no commit yet
+    assert runtime.git_commit(tmp_path) is None  # no commit yet
     result = tmp_path / "experiments" / "results" / "found.json"
     result.parent.mkdir(parents=True)
     for path in (tmp_path / "file", result):
         path.write_text("1")
     git("add", ".")
     git("commit", "--quiet", "--no-verify", "-m", "one")
-    commit = runtime._git_commit(tmp_path)
+    commit = runtime.git_commit(tmp_path)
     assert commit == git("rev-parse", "HEAD") and re.fullmatch(r"[0-9a-f]{40,64}", commit)
     result.write_text("2")
-    assert runtime._git_commit(tmp_path) == commit
+    assert runtime.git_commit(tmp_path) == commit
     (tmp_path / "file").write_text("2")
-    assert runtime._git_commit(tmp_path) == f"{commit}-dirty"
+    assert runtime.git_commit(tmp_path) == f"{commit}-dirty"
 
 
 def test_device_has_a_name(monkeypatch):

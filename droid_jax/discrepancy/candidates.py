@@ -122,6 +122,12 @@ class ScoreTest:
         return np.argsort(-self.explained).tolist()
 
 
+def rows_of(found: ScoreTest, parts: Sequence[Candidate]) -> list[int]:
+    """The directions of some candidates, in the shapes that they have."""
+    keys = {part.shaped_key for part in parts}
+    return [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
+
+
 def sensitivities(
     residual_set: ResidualSet,
     values: np.ndarray,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
@@ -15,6 +15,8 @@ from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import CmaConfig
 from droid_jax.simulate.windows import WindowConfig
 
+# Where each row of a batch counts: in first steps that share one, and of long logs.
+FEWER_TRIALS = {"dampings": (1e-2, 1e0, 1e1, 1e3), "lengths": (1.0,)}
 CONVERGE_ITERATIONS = 60  # of a fit that must converge: where something is missing it takes longer
 
 
@@ -168,7 +170,7 @@ class DiscrepancyConfig:
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=CONVERGE_ITERATIONS))
     refit: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0))
     one_step: LevenbergMarquardtConfig = field(
-        default_factory=lambda: LevenbergMarquardtConfig(dampings=(1e-2, 1e0, 1e1, 1e3), lengths=(1.0,))
+        default_factory=lambda: replace(LevenbergMarquardtConfig(), **FEWER_TRIALS)
     )
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
     one_step_fits: int = 12

@@ -128,7 +128,7 @@ def one_step_fits(
         config: of the steps.
     """
     whole = residual_set.cost.space
-    looks, rest = list[Look](), list[np.ndarray]()
+    looks = list[Look]()
     for part, sensitivities, proposed in asked:
         space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
         jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
@@ -138,18 +138,9 @@ def one_step_fits(
         without, coefficients = proposed.copy(), [whole.index(name) for name in part.coefficients]
         without[coefficients] = model.values[coefficients]
         starts = np.stack([without, proposed])[:, whole.columns(space)]
-        looks.append(Look(space, starts, jacobian, functools.partial(_over, whole, space, without)))
-        rest.append(without)
+        looks.append(Look(space, starts, jacobian, functools.partial(whole.embed, space, values=without)))
     ended = chords(residual_set.whitened, looks, config)
-    each = zip(looks, rest, ended, strict=True)
-    return [
-        (whole.embed(look.space, values[None], without)[0], objective) for look, without, (values, objective) in each
-    ]
-
-
-def _over(whole: Space, space: Space, rest: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """[P, W] over a whole space of rows [P, D] over a part of it, the rest as in `rest` [W]."""
-    return whole.embed(space, rows, rest)
+    return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ended, strict=True)]
 
 
 def base_fit(

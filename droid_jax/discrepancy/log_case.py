@@ -17,7 +17,7 @@ import numpy as np
 from droid_jax.cost.lone_log import LoneLog, lone_log
 from droid_jax.cost.noise import stated_deviation
 from droid_jax.cost.windowed_log import WindowedLog, windowed_log
-from droid_jax.discrepancy.candidates import Proposal, ScoreTest, directions_of, proposals, score_test
+from droid_jax.discrepancy.candidates import Proposal, ScoreTest, directions_of, proposals, rows_of, score_test
 from droid_jax.discrepancy.case import (
     Case,
     ResidualSet,
@@ -28,7 +28,7 @@ from droid_jax.discrepancy.case import (
     restrained,
     unbounded,
 )
-from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.config import FEWER_TRIALS, DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, interleaved
 from droid_jax.identify.evaluation import evaluate_on, evaluation_json
@@ -194,7 +194,7 @@ def refitted_residual(case: Case, model: FittedModel, found: ScoreTest, columns:
 
     def share(proposal: Proposal) -> float:
         """Of the column in which it leaves least."""
-        rows = _rows_of(found, proposal)
+        rows = rows_of(found, proposal.parts)
         sizes = [proposal.sizes[found.directions[k].coefficient] for k in rows]
         left = common - sizes @ found.sensitivities[rows]
         return float(np.min(np.sum(left.reshape(columns, -1) ** 2, axis=1) / np.maximum(whole, 1e-30)))
@@ -243,16 +243,10 @@ def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: Dis
         best = proposals(found, left[None], space)[0]
         if best.explained < config.selection.least_gain:
             break
-        taken, _ = np.linalg.qr(found.sensitivities[_rows_of(found, best)].T)
+        taken, _ = np.linalg.qr(found.sensitivities[rows_of(found, best.parts)].T)
         left = left - taken @ (taken.T @ left)
         found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
     return left
-
-
-def _rows_of(found: ScoreTest, proposal: Proposal) -> list[int]:
-    """The directions of a proposal's candidates, in the shapes proposed."""
-    keys = {part.shaped_key for part in proposal.parts}
-    return [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
 
 
 def with_blocks(
@@ -263,7 +257,6 @@ def with_blocks(
 
 
 PARTS = 2  # training and validation
-FEWER_TRIALS = {"dampings": (1e-2, 1e0, 1e1, 1e3), "lengths": (1.0,)}  # of long logs, where each row of a batch counts
 DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
 BEST = 1  # of them
 LEAST_TEST = 4  # units of a test part

@@ -20,6 +20,7 @@ from droid_jax.discrepancy.candidates import (
     collinear,
     directions_of,
     proposals,
+    rows_of,
     score_test,
 )
 from droid_jax.discrepancy.case import Case
@@ -222,10 +223,8 @@ def _one_step_fits(
         for proposal in some:
             (part,), start = proposal.parts, proposal.start(problem.case.full_space, model.values)
             problem.progress("one_step_fit", names_of((*model.keys, part.key)))
-            same = {
-                d.coefficient: k for k, d in enumerate(found.directions) if d.candidate.shaped_key == part.shaped_key
-            }
-            asked.append((part, {a: found.raw[k] for a, k in same.items()}, start))
+            raw = {found.directions[k].coefficient: found.raw[k] for k in rows_of(found, proposal.parts)}
+            asked.append((part, raw, start))
         ended = one_step_fits(problem.case.train, model, asked, config.one_step)
         out += [(*end, proposal) for end, proposal in zip(ended, some, strict=True)]
     return out, Notes()

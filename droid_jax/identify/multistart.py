@@ -196,9 +196,10 @@ def refine(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
     state, _ = problem.descend(state)
-    if config.basin_hops and not problem.misses(state):
+    hops = 0 if problem.misses(state) else config.basin_hops
+    if hops:
         state = problem.back(state)
-    state, slopes, settled = problem.hopped(state)
+    state, slopes, settled = problem.hopped(state, hops)
     return Refined(
         space=space,
         x=state.x[0],
@@ -341,16 +342,14 @@ class _Descent(DampedProblem):
         which = ~self.space.nuisance & far & open_
         return [self.space.names[k] for k in np.flatnonzero(which)]
 
-    def hopped(self, state: Starts) -> tuple[Starts, np.ndarray | None, bool]:
+    def hopped(self, state: Starts, hops: int) -> tuple[Starts, np.ndarray | None, bool]:
         """Leave small basins, as often as that pays and no more than `hops` times; one start.
 
         Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more, or none
         was to be made.
         """
-        settled, slopes = self.config.basin_hops == 0, None
-        for number in range(self.config.basin_hops):
-            if self.misses(state):
-                return state, slopes, True
+        settled, slopes = hops == 0, None
+        for number in range(hops):
             slopes = self.jacobian(state)[0]
             hopped = self.hop(state, slopes, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]

@@ -54,7 +54,8 @@ class IdentifyConfig:
         refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
         beginning: s of long recordings that the search and the first refinement see, and more until every joint has
             moved through half of its range; the last refinement sees all.
-        sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`).
+        sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`),
+        sorting_ratio: and their `RefineConfig.pruning_ratio`.
         samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
         sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
         seed: of those samples (the search has its own).
@@ -78,6 +79,7 @@ class IdentifyConfig:
     refine: RefineConfig | None = field(default_factory=RefineConfig)
     beginning: float = 20.0
     sorting: int = 3
+    sorting_ratio: tuple[float, ...] = (3.0, 1.3, 1.0)
     samples: int = 200
     sample_steps: int = 5_000_000
     seed: int = 0
@@ -96,6 +98,7 @@ class IdentifyConfig:
             refine=optional(partial(instance, kind=RefineConfig)),
             beginning=partial(number, above=0, infinite=True),
             sorting=partial(whole, least=0),
+            sorting_ratio=several(partial(number, least=1)),
             samples=partial(whole, least=0),
             sample_steps=partial(whole, least=1),
             seed=partial(whole, least=0),
@@ -148,7 +151,6 @@ Progress = Callable[[str, Any], None]
 # In plain C no block of trials is filled up with copies, nothing sticks or slips beside an optimum (contact pairs are
 # MJX's), and in double precision the first slopes already tell the posterior's axes.
 IN_C = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,), "patience": 2, "basin_hops": 0, "spreads": 1}
-SORTING = (3.0, 1.3, 1.0)  # pruning ratios of a few iterations that sort two starts
 FEWEST = 16  # samples of a Gaussian that show its spread
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
@@ -420,10 +422,11 @@ def _refined(
     early = early.restated(begin[0])
     first = run(early, early.first(), begin)
     base, count = base.restated(first.best), first.evaluations
-    settled = replace(settings, basin_hops=0, patience=1)  # the first one has looked for other basins, and twice
+    # The first one has looked for other basins, and in plain C twice where nothing was found.
+    settled = replace(settings, basin_hops=0, patience=(config.refine or settings).patience)
     if acting := with_acting(base.space, first.best, effects):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
-        short = replace(settled, iterations=config.sorting, spreads=0, pruning_ratio=SORTING)
+        short = replace(settled, iterations=config.sorting, spreads=0, pruning_ratio=config.sorting_ratio)
         first = run(worst, None, np.stack([first.best, *acting]), short)
         base, count = base.restated(first.best), count + first.evaluations
     last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)

@@ -164,9 +164,7 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
         for row, element in elements.items():
             changed += [(kind, element, row, f) for f in _write_changed(kind, element, row, scene.model, model)]
     changed += [("actuator", a, a.id, "actuator_biasprm") for a in _settle(spec, model)]
-    changed += [
-        ("dof", e, row, "dof_solimp") for row, e in _elements(spec, model)["dof"].items() if e.name in scene.held
-    ]
+    changed += [("dof", e, row, "dof_solimp") for row, e in by_kind["dof"].items() if e.name in scene.held]
     for joint in before.joints:  # friction that holds here creeps in the user's file
         if joint.name in scene.held:
             joint.solimp_friction = list(SOFT_IMPEDANCE)

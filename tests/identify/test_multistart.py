@@ -418,20 +418,23 @@ def test_a_first_look_tries_what_its_settings_say():
 
 
 def test_first_looks_share_their_batches_and_each_ends_as_by_itself():
-    """Each frees one of two parameters; one that no longer pays asks for no further trials."""
-    matrix, frees = np.array([[3.0, 1.0], [1.0, 2.0], [1.0, -1.0]]), (0, 1)
-    recorder = Recorder(lambda v: 10.0 * np.arctan(0.1 * (v @ matrix.T - [30.0, 20.0, 5.0])))
+    """Each frees one of two parameters.  The first is linear: after one batch its trials no longer pay."""
+
+    def apart(v: np.ndarray) -> np.ndarray:
+        return np.stack([v[:, 0] - 1.5, 10.0 * np.arctan(0.1 * (3.0 * v[:, 1] - 30.0))], axis=1)
+
+    recorder, slopes = Recorder(apart), np.diag([1.0, 3.0])
     looks = [
-        Look(Space((line(name),)), np.array([[0.0], [1.0]]), matrix[:, [k]], partial(with_zero, k))
-        for k, name in zip(frees, "ab", strict=True)
+        Look(Space((line(name),)), np.array([[0.0], [1.0]]), slopes[:, [k]], partial(with_zero, k))
+        for k, name in enumerate("ab")
     ]
     together, batches = chords(recorder, looks), [len(rows) for rows in recorder.asked]
+    each = 2 * RefineConfig().trials  # of a look of two starts
+    assert batches == [4, 2 * each, each, each]
     for look, found in zip(looks, together, strict=True):
         alone = chords(recorder, [look])[0]
         np.testing.assert_allclose(found[0], alone[0])
         assert found[1] == pytest.approx(alone[1])
-    trials = RefineConfig().trials
-    assert batches[:2] == [4, 4 * trials] and set(batches[2:]) <= {4 * trials, 2 * trials}
 
 
 def with_zero(column: int, rows: np.ndarray) -> np.ndarray:
