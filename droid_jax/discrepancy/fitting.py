@@ -149,13 +149,13 @@ def base_fit(
     """Everything but the effects, fitted to the training recording.
 
     start: [F] values of the base parameters out of an earlier fit; without it they are searched for.  That fit has
-      looked for other basins, and this one does not again.
+      looked for other basins, and this one does not again, neither by hops nor by hypotheses of the grip.
     """
     if start is None:
         return fitted_from_prior(train, base, (), config, progress)
-    config = replace(config, refine=replace(config.refine, basin_hops=0))
+    settings = replace(config.refine, basin_hops=0)
     begin = train.cost.space.embed(base, np.clip(start, base.low, base.high)[None])
-    return _refined(train, base, (), begin, config, progress)
+    return refit(train, base, (), begin, settings, progress=lambda p: progress("refine", p))
 
 
 def fitted_from_prior(
@@ -182,22 +182,8 @@ def fitted_from_prior(
         progress=lambda p: progress("search", p),
     )
     space = whole.select([*base.names, *coefficients])
-    return _refined(train, base, parts, whole.embed(space, starts(space, main, found), at), config, progress)
-
-
-def _refined(
-    train: ResidualSet,
-    base: Space,
-    parts: Sequence[Candidate],
-    begin: np.ndarray,
-    config: DiscrepancyConfig,
-    progress: Progress,
-) -> FittedModel:
-    """begin: [S, D] over the whole space."""
-    hypotheses = grip_hypotheses(base)
-    return refit(
-        train, base, parts, begin, config.refine, hypotheses=hypotheses, progress=lambda p: progress("refine", p)
-    )
+    begin, hypotheses = whole.embed(space, starts(space, main, found), at), grip_hypotheses(base)
+    return refit(train, base, parts, begin, config.refine, hypotheses, lambda p: progress("refine", p))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import pytest
 from benchmarks import default_run, gpu, scaling
 from benchmarks.default_run import Line, command_lines, figures
 from benchmarks.durations import OPTION, summary
-from benchmarks.peers import springs, sysid
+from benchmarks.peer_problems import springs, sysid
 from droid_jax.commands import all_stages as whole
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide

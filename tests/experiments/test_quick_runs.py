@@ -24,7 +24,7 @@ DATA = {  # folders of real logs
     "experiments/real_panda.py": "franka_gaz2019",
     "experiments/real_so101.py": "so101",
     "experiments/real_xl330.py": "bam_xl330",
-    "benchmarks/peer_logs.py": ".",
+    "benchmarks/peers.py": ".",
 }
 # Arguments before --quick --out, by script.
 SCRIPTS: dict[str, tuple[str, ...]] = {

@@ -2,7 +2,7 @@
 
 Both fit the same parameters from the same start, all but the last three of ten repeats of demonstrations A and C.
 Nuisances are drawn from priors that this program's fit knows; sysid has no word for a prior, so one of its fits gets
-them as further rows of its residual (`peers/sysid.py`).
+them as further rows of its residual (`peer_problems/sysid.py`).
 Judge of both is plain C MuJoCo at half a millisecond, on the three repeats that neither has seen.
 """
 
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from identify_suite import recordings, settings
 
-from benchmarks.peers import sysid as peer
-from benchmarks.peers.gap import run_gap
+from benchmarks.peer_problems import sysid as peer
+from benchmarks.peer_problems.gap import run_gap
 from droid_jax.cost.cost import make_cost
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
@@ -33,7 +33,7 @@ from droid_jax.synthetic.hidden_effects import record_hidden
 from droid_jax.synthetic.robot import synthetic_truth
 
 OURS, THEIRS, JUDGE = 0.004, 0.002, 0.0005  # s, time steps; ours is of second order
-WAYS: dict[str, dict[str, bool]] = {
+WAYS: dict[str, dict[str, Any]] = {
     "sysid": {},
     "sysid, off the bounds": {"off_bounds": True},  # follows its own warning about the start
     "sysid, told the priors": {"off_bounds": True, "priors": True},  # of the nuisances, as ours is
@@ -104,12 +104,16 @@ def _figures(
 
 def heldout_gap(space: Space, data: Sequence[Recording], values: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Equation 1 without penalties, N m, of each vector on the repeats that no fit has seen, by recording."""
-    held = [split_repeats(r, 0.3)[1] for r in data]
+    return distances_on(space, [split_repeats(r, 0.3)[1] for r in data], values)
+
+
+def distances_on(space: Space, held: Sequence[Recording], values: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The same on all repeats of recordings."""
     judge = make_cost(door_scene(timestep=JUDGE), space, held, engine="mujoco")
     rows = np.stack(list(values.values()))
     distances = judge.distances(rows) - judge.penalties(rows)
     return {
-        name: dict(zip([r.name for r in data], row.tolist(), strict=True))
+        name: dict(zip([r.name for r in held], row.tolist(), strict=True))
         for name, row in zip(values, distances, strict=True)
     }
 

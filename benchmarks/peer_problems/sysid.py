@@ -2,7 +2,7 @@
 
 What is ours here is what a user would have to write: how values enter the model, and where a time offset
 and torque offsets enter a prediction.  Rollouts, residual, least squares, intervals and what its report
-says about the result are its own.
+says about the result are its own.  What imports jax is imported where it is used: its own models are fitted without.
 """
 
 from __future__ import annotations
@@ -10,18 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from droid_jax.model.parameters import Parameter, Space
-from droid_jax.model.physics import make_c_model
-from droid_jax.model.scene import Scene
-from droid_jax.recordings.clocks import interpolate
-from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.c_engine import instrument
-from droid_jax.simulate.replay import make_drive
-from droid_jax.simulate.servo_gains import scale_gains, servo_factors
+if TYPE_CHECKING:
+    from droid_jax.model.parameters import Space
+    from droid_jax.model.scene import Scene
+    from droid_jax.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +79,8 @@ def fit(
     priors: of the nuisances, as rows of the residual (`with_priors`).
     options: of its optimiser (max_iters, x_scale, optimizer, ...).
     """
+    from droid_jax.simulate.c_engine import instrument
+
     plain = replace(scene, model=instrument(scene))
     each = [_residual(plain, space, recording, channel) for recording in recordings]
 
@@ -98,6 +96,10 @@ def fit(
 
 def _residual(plain: Scene, space: Space, recording: Recording, channel: str) -> Callable[..., Any]:
     """Its residual function of one recording; plain: the scene with its sensors."""
+    from droid_jax.model.physics import make_c_model
+    from droid_jax.simulate.replay import make_drive
+    from droid_jax.simulate.servo_gains import scale_gains, servo_factors
+
     sysid = library()
     drive = make_drive(plain, recording)
     factors = servo_factors(plain, drive)
@@ -115,13 +117,12 @@ def _residual(plain: Scene, space: Space, recording: Recording, channel: str) ->
     )
 
 
-def parameters_of(space: Space, modifier: Callable[[Parameter], Callable[..., None]] | None = None) -> Any:
-    """Its parameters at our means and within our bounds; modifier: how one enters an MjSpec, where that is its way."""
+def parameters_of(space: Space) -> Any:
+    """Its parameters at our means and within our bounds."""
     sysid = library()
     parameters = sysid.ParameterDict()
     for p in space.parameters:
-        how = None if modifier is None else modifier(p)
-        parameters.add(sysid.Parameter(p.name, nominal=p.mean, min_value=p.low, max_value=p.high, modifier=how))
+        parameters.add(sysid.Parameter(p.name, nominal=p.mean, min_value=p.low, max_value=p.high))
     return parameters
 
 
@@ -168,6 +169,8 @@ def _difference(scene: Scene, space: Space, channel: str) -> Any:
 
     Rows of sensors belong to the state before a step, its clock to the state after it.
     """
+    from droid_jax.recordings.clocks import interpolate
+
     sysid = library()
     joints = len(scene.joints)
     first = joints if channel == "position" else 0  # column of the sensors: torques, then positions
