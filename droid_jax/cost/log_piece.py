@@ -28,6 +28,7 @@ from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
 LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
+MANY = 8  # windows of a sample from which its batches always have many rows
 TRACES = ("torque", "position", "velocity", "object_angle")
 
 
@@ -105,7 +106,7 @@ class Piece:
         for s in (1.0, -1.0):
             start, speed = windows.start[which] + s * step[:, :dofs], windows.speed[which] + s * step[:, dofs:]
             given = windows.table[which], start, windows.gains[which], speed, windows.begin[which]
-            parts = [self.smoothed(r, which[of])["smooth"] for r, of in _blocks(self.program, rows, given)]
+            parts = [self.smoothed(r, which[of])["smooth"] for r, of in _blocks(self.program, rows, given, self.count)]
             ends.append(np.concatenate(parts))
         found = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
         return np.moveaxis(found, 1, -1)
@@ -150,7 +151,7 @@ def _together(
     names = ("table", "start", "gains", "speed", "begin")
     given = [np.concatenate([getattr(p.windows, name) for p in pieces])[first[piece] + window] for name in names]
     parts = list[list[dict[str, np.ndarray]]]([] for _ in pieces)
-    for rollout, of in _blocks(pieces[0].program, np.repeat(values, each, axis=0), given):
+    for rollout, of in _blocks(pieces[0].program, np.repeat(values, each, axis=0), given, each):
         for i in np.unique(piece[of]).tolist():
             mine = piece[of] == i
             some = rollout if mine.all() else Rollout(*(getattr(rollout, f.name)[mine] for f in fields(rollout)))
@@ -164,10 +165,13 @@ def _together(
 
 
 def _blocks(
-    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[np.ndarray]
+    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[np.ndarray], each: int
 ) -> Iterator[tuple[Rollout, np.ndarray]]:
-    """The Rollouts of rows [R, D] and of what else a program takes, block by block, on the host, and which they are."""
-    size = block_size(len(values))
+    """The Rollouts of rows [R, D] and of what else a program takes, block by block, on the host, and which they are.
+
+    each: rows that every sample has.
+    """
+    size = block_size(len(values), each >= MANY)
     for first in range(0, len(values), size):
         rows = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
         count = min(size, len(values) - first)

@@ -178,10 +178,14 @@ def _lacking(effects: Keys, indistinguishable: Sequence[Alternatives]) -> str:
 
 
 def _lost_narrowly(tests: Sequence[ValidationTest]) -> list[str]:
-    """Candidates that lost for their size or their significance alone: one of them may be all there is."""
+    """Candidates that lost for their size or their significance alone: one of them may be all there is.
+
+    A model with all the effects of another one, and more, is not listed beside it.
+    """
 
     def only(reason: Reason) -> list[ValidationTest]:
-        return [t for t in tests if t.reasons and all(r.reason is reason for r in t.reasons)]
+        lost = [t for t in tests if t.reasons and all(r.reason is reason for r in t.reasons)]
+        return [t for t in lost if not any({*other.keys} < {*t.keys} for other in lost)]
 
     large = {names_of(t.keys): " and ".join(r.text for r in t.reasons) for t in only(Reason.AT_BOUND)}
     groups = (

@@ -60,6 +60,11 @@ def test_blocks_cover_the_rows_once_and_repeat_the_last():
     assert (last[count:] == last[count - 1]).all()
 
 
+def test_where_rows_are_always_many_a_cpus_block_is_larger():
+    assert block_size(45) == block_size(4500) < block_size(45, many=True) == block_size(4500, many=True)
+    assert block_size(45, many=True) % runtime.devices_mesh().size == 0
+
+
 def test_the_tests_run_on_two_devices_and_a_block_uses_both():
     assert runtime.devices_mesh().size == 2
     out = over_block(lambda v: v.sum())(np.ones((32, 3)))
