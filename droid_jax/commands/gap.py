@@ -120,7 +120,7 @@ class GapCommand:
 def run(command: GapCommand) -> None:
     """Record or load, fit, search, write the run's folder and its page."""
     from droid_jax import runtime
-    from droid_jax.report.progress import FOLDER, needs_writer
+    from droid_jax.report.progress import FOLDER, needs_writer, stages
 
     command = with_robot_options(command)
     needs_scene(command)
@@ -164,10 +164,11 @@ def run(command: GapCommand) -> None:
     if not given:
         assert command.springs is not None  # settled
         roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)
-    then = "; then first fits, which tell the noise: minutes for a long log" if split is Split.WINDOWS else ""
+    then = "; then first fits, which tell the noise" if split is Split.WINDOWS else ""
     print(f"compiling the replay{then} ...", flush=True)
     began = time.monotonic()
-    case = case_of(split, scene, base, effects, roles, config, start)
+    with stages(("first_fits",)) as show:
+        case = case_of(split, scene, base, effects, roles, config, start, lambda now: show("first_fits", now))
     preparation = time.monotonic() - began
     begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
     board = out / FOLDER if command.tensorboard else None

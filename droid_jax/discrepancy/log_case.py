@@ -44,6 +44,7 @@ from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 from droid_jax.simulate.windows import held
 
 Log: TypeAlias = LoneLog | WindowedLog
+Report: TypeAlias = Callable[[RefineProgress], None] | None
 
 
 def make_log(
@@ -110,9 +111,7 @@ def single_case(
     return Case(train, validation, judged, base, tuple(effects), config)
 
 
-def base_model(
-    case: Case, start: np.ndarray | None = None, progress: Callable[[RefineProgress], None] | None = None
-) -> FittedModel:
+def base_model(case: Case, start: np.ndarray | None = None, progress: Report = None) -> FittedModel:
     """The base parameters of a case in blocks fitted, from where the case says unless a start [D] is given.
 
     Inverse dynamics is smooth in them, and windows nearly are, so one start and no search will do.
@@ -141,6 +140,7 @@ def noise_of(
     end: float,
     config: DiscrepancyConfig,
     start: np.ndarray | None,
+    progress: Report = None,
 ) -> NoiseEstimate:
     """What to state as the noise of a log, and how long its blocks are, from what lies before `end`.
 
@@ -160,8 +160,8 @@ def noise_of(
     block = fewest_blocks(log.clock[inside], log.clock[0])
     block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
     if start is None:  # what the prior's mean leaves is no noise
-        start = _rough_fit(log, base, effects, log.space.mean, block, config)[1].values
-    case, model, deviation = _rough_fit(log, base, effects, start, block, config)
+        start = _rough_fit(log, base, effects, log.space.mean, block, config, progress)[1].values
+    case, model, deviation = _rough_fit(log, base, effects, start, block, config, progress)
     found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
     common = model.residuals.mean(axis=0)
 
@@ -171,7 +171,9 @@ def noise_of(
 
     whole, rest = by_column(common), by_column(least_residual(found, common, log.space, config))
     # Inverse dynamics is nearly linear in what an effect adds; a replay is not.
-    refitted = refitted_residual(case, model, found, len(deviation)) if isinstance(log, WindowedLog) else None
+    refitted = None
+    if isinstance(log, WindowedLog):
+        refitted = refitted_residual(case, model, found, len(deviation), progress)
     if refitted is not None:
         other = by_column(refitted)
         rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
@@ -183,7 +185,9 @@ def noise_of(
     return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
 
 
-def refitted_residual(case: Case, model: FittedModel, found: ScoreTest, columns: int) -> np.ndarray | None:
+def refitted_residual(
+    case: Case, model: FittedModel, found: ScoreTest, columns: int, progress: Report = None
+) -> np.ndarray | None:
     """[M] what the candidate that takes most of any one column leaves once it is fitted in full; None where none takes
     `BlocksConfig.refit_share` of a column.
 
@@ -204,7 +208,8 @@ def refitted_residual(case: Case, model: FittedModel, found: ScoreTest, columns:
     if least > 1 - case.config.blocks.refit_share:
         return None
     try:
-        fitted = refit(case.train, case.base, best.parts, best.start(space, model.values)[None], case.config.refit)
+        start = best.start(space, model.values)[None]
+        fitted = refit(case.train, case.base, best.parts, start, case.config.refit, progress=progress)
     except NotReplayed:
         return None
     return fitted.residuals.mean(axis=0)
@@ -224,6 +229,7 @@ def _rough_fit(
     values: np.ndarray,
     block: np.ndarray,
     config: DiscrepancyConfig,
+    progress: Report,
 ) -> tuple[Case, FittedModel, np.ndarray]:
     """The base fitted with the noise [C] stated that `values` [D] leave."""
     noise, inside = config.compare.noise, block >= 0
@@ -231,7 +237,7 @@ def _rough_fit(
     deviation = np.maximum(left, log.least_noise())
     rows = with_blocks(log, deviation, block, config)
     case = Case(rows, rows, None, base, tuple(effects), config)
-    return case, base_model(case, values), deviation
+    return case, base_model(case, values, progress), deviation
 
 
 def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
@@ -270,16 +276,20 @@ def case_of(
     roles: Mapping[str, Recording],
     config: DiscrepancyConfig,
     start: np.ndarray | None = None,
+    progress: Report = None,
 ) -> Case:
     """Of recordings by role (see `preflight.search_inputs.assigned_roles`), logs where they are cut in time.
 
     start: [F] values of the base parameters out of an earlier fit, where those of commanded logs in blocks begin.
+    progress: called with each iteration of the first fits of commanded logs, which tell the noise.
     Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
     Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
     """
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
     if split is Split.WINDOWS:
-        return windowed_case(scene, base, effects, pooled(roles, "train"), pooled(roles, "test"), config, start)
+        return windowed_case(
+            scene, base, effects, pooled(roles, "train"), pooled(roles, "test"), config, start, progress
+        )
     if split is not Split.BLOCKS:
         return make_case(scene, base, effects, **roles, config=config)
     config = replace(config, refine=replace(config.refine, basin_hops=0, spreads=0))  # inverse dynamics is smooth
@@ -295,6 +305,7 @@ def windowed_case(
     test: Sequence[Recording] = (),
     config: DiscrepancyConfig | None = None,
     start: np.ndarray | None = None,
+    progress: Report = None,
 ) -> Case:
     """A case of pooled logs: their windows train and validate in turns, block by block.
 
@@ -309,6 +320,7 @@ def windowed_case(
         test: others.
         config: of the search.
         start: [F] values of the base parameters where its fit begins; None: the best of some draws.
+        progress: called with each iteration of the first fits, which tell the noise.
 
     Raises:
         ValueError: recordings of different channels or joints, or so short that no two blocks are in each part.
@@ -334,11 +346,11 @@ def windowed_case(
         judged = windowed_log(scene, unbounded(whole, own), test, compare, judging, effects, whole=at_once)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
     if start is None:
-        first = _first_values(log, base, effects, end, rough)
+        first = _first_values(log, base, effects, end, rough, progress)
     else:
         first = whole.embed(base, np.clip(start, base.low, base.high)[None])[0]
     # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
-    noise = noise_of(log.about(first), base, effects, end, rough, first)
+    noise = noise_of(log.about(first), base, effects, end, rough, first, progress)
     log = log.about(noise.values)
     plan = planned(log, noise.block, config.blocks.shortest, judged is None)
     sets = [
@@ -395,7 +407,12 @@ def _end_of(log: WindowedLog) -> float:
 
 
 def _first_values(
-    log: WindowedLog, base: Space, effects: Sequence[Effect], end: float, config: DiscrepancyConfig
+    log: WindowedLog,
+    base: Space,
+    effects: Sequence[Effect],
+    end: float,
+    config: DiscrepancyConfig,
+    progress: Report = None,
 ) -> np.ndarray:
     """[D] the base fitted from its mean and from the best of some draws of its prior."""
     whole, inside = log.space, log.clock < end
@@ -412,7 +429,7 @@ def _first_values(
     rough = with_blocks(log, np.sqrt(np.mean(left**2, axis=0)), block, config, 1)
     cost = np.nan_to_num(np.sum(rough.whitened(rows) ** 2, axis=1), nan=np.inf)
     starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[:BEST]]])
-    return refit(rough, base, (), starts, config.refine).values
+    return refit(rough, base, (), starts, config.refine, progress=progress).values
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,7 +118,7 @@ def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.Mon
     )
     asked = list[Any]()
 
-    def refit(train: Any, base: Any, parts: Any, *rest: Any) -> Any:
+    def refit(train: Any, base: Any, parts: Any, *rest: Any, **more: Any) -> Any:
         asked.append(parts)
         return SimpleNamespace(residuals=np.tile(left - size * mark.ravel(), (3, 1)))
 
