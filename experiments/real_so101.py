@@ -13,7 +13,8 @@ control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml
 MuJoCo's default friction creeps where the arm stands still; a fit holds it (`--joint-friction`).
 
 With --gap: what does a model of 24 parameters and a delay (gain, armature, damping and friction of each of the six
-joints) with MuJoCo's default friction lack?  `gap` searches the four motions, and the two others are its test data.
+joints) with MuJoCo's default friction lack?  `identify` fits it to the four motions and `gap` searches them from there;
+the two others are its test data.
 """
 
 from __future__ import annotations
@@ -129,10 +130,13 @@ def searched(config: RealSo101) -> dict[str, Any]:
     options = ["--effects", "soft_friction"] if config.quick else []
     options += ["--budget", str(config.budget)] if config.budget else []
     began, parameters = time.monotonic(), parameters_of_joints(runs / "so101_24.json")
+    fit, judges = [paths[m] for m in JUDGES], [paths[m] for m in FIT]
+    own = ["--joint-friction", "scene", "--seed", str(config.seed)]
+    few = ["--generations", "3"] if config.quick else []
+    fitted(scene_of(config.data), parameters, fit, judges, runs / "identify_24", [*own, *few])
     command(
-        ["gap", "--scene", scene_of(config.data), "--joint-friction", "scene",
-         "--parameters", parameters, *options, "--seed", str(config.seed),
-         "--recording", *(paths[m] for m in JUDGES), "--judge-on", *(paths[m] for m in FIT), "--out", runs / "gap"]
+        ["gap", "--scene", scene_of(config.data), "--parameters", parameters, *own, *options,
+         "--fit", runs / "identify_24", "--recording", *fit, "--judge-on", *judges, "--out", runs / "gap"]
     )  # fmt: skip
     found = json.loads((runs / "gap" / GAP).read_text())
     mae = {

@@ -46,8 +46,8 @@ class WindowConfig:
     reach: float = 0.06
     every: float | None = None
     longest: float = 120.0
-    samples: int = 24
-    sample_length: float = 1.5
+    samples: int = 48
+    sample_length: float = 3.0
     sample_lead: float = 0.5
 
     def __post_init__(self) -> None:
