@@ -71,6 +71,7 @@ def gap_doubts(gap: Gap) -> list[str]:
     asked = {
         "validation_chose": "test" not in gap.roles and not gap.lost,
         "test_lost": gap.lost,
+        "test_worse": test_worse(gap),
         "limits": bool(gap.found.split.limits),
         "coarse": coarse_share(gap) is not None,
         "step_unknown": gap.found.discretisation_error is None,
@@ -81,6 +82,12 @@ def gap_doubts(gap: Gap) -> list[str]:
         **{name: name in gap.found.missing_amendments for name in ("experiments", "final_refit")},
     }
     return [name for name, holds in asked.items() if holds]
+
+
+def test_worse(gap: Gap) -> bool:
+    """Whether a model with effects does worse than the base model on the recordings that no fit saw."""
+    test = gap.found.discrepancies.get("test")
+    return gap.extended and test is not None and test.closed is not None and test.closed < 0
 
 
 def coarse_share(gap: Gap) -> float | None:
@@ -118,6 +125,8 @@ def gap_next_step(gap: Gap) -> str:
         if gap.found.hints:
             return "hints"
         return "none passed clearly" if any(t.passed for t in gap.found.validation_tests) else "none passed"
+    if verdict == "named" and {e.effect for e in gap.found.effects} == {"soft_friction"}:
+        return "named in the simulator"
     return verdict
 
 

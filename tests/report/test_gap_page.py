@@ -188,6 +188,21 @@ def test_what_is_no_doubt_is_not_said(made: Callable, changes: dict, doubt: str)
     assert "the fitted model on the test recording" not in written.text
 
 
+def test_a_model_that_does_worse_on_the_test_recording_is_doubted(made: Callable) -> None:
+    of = gap_json("named", ROLES)["discrepancies"]
+    of["test"] |= {"after": 1.5 * of["test"]["before"], "closed": -0.5}
+    gap, written = made("named", discrepancies=of)
+    assert "test_worse" in gap_doubts(gap) and "does worse than without" in spaced(written.doubts["test_worse"])
+    assert "50 % more" in spaced(written.text)
+    assert "test_worse" not in gap_doubts(made("named")[0])
+
+
+def test_friction_that_creeps_is_mended_in_the_mjcf(made: Callable) -> None:
+    gap, written = made("named", effects=[{"effect": "soft_friction", "location": "all joints"}])
+    assert gap_next_step(gap) == "named in the simulator"
+    assert "solimpfriction" in written.ids["gap-next"]["text"] and "hardware" in written.ids["gap-next"]["text"]
+
+
 @pytest.mark.parametrize("after", [0.0, -0.006])
 def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
     of = gap_json("named", ROLES)["discrepancies"]
