@@ -45,6 +45,8 @@ class RehearsalConfig:
       1.4 times that and not at it, since another robot's parameters and law are not quite the linear ones.
     known: share of what is left of an effect that the library's own must take, for it to be said to be found.
     faster: how many times as fast the other motion is.
+    samples, sample_length: windows, and s of each, of long logs of held joints (`WindowConfig`): a search replays more
+      and longer ones, for ten minutes and not for two, and what these show it sees too.
     seed: of the draws.
     """
 
@@ -58,6 +60,8 @@ class RehearsalConfig:
     margin: float = 1.4
     known: float = 0.5
     faster: float = 1.5
+    samples: int = 24
+    sample_length: float = 1.5
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -72,6 +76,8 @@ class RehearsalConfig:
             margin=partial(number, least=1),
             known=partial(number, least=0, below=1),
             faster=partial(number, above=0),
+            samples=partial(whole, least=1),
+            sample_length=partial(number, above=0),
             seed=partial(whole, least=0),
         )
 

@@ -96,7 +96,8 @@ def rehearsed(
     start = space.values(dict(plan.values or {}))
     whole = joined(space, effects)
     at = whole.embed(space, start[None])[0]
-    config = replace(config, channels=plan.channels or config.channels)
+    fewer = replace(config.windows, samples=rehearsal.samples, sample_length=rehearsal.sample_length)
+    config = replace(config, channels=plan.channels or config.channels, windows=fewer)
     clean = clean_channels(scene, space, whole, effects, at, plan, config)
     made, noise = _made(clean, scene, recordings[:1] if train_only else recordings, plan, rehearsal)
     chosen = _compared(scene, recordings, made, plan, config)
