@@ -9,8 +9,9 @@ logs of positions (DIR holds the folders go2_leg, bam_xl330 and so101 of the dat
 no effect of the library is in these fits.
 
 Every fit is a process of its own, and the programs take turns.  `seconds` holds the start of the process,
-`fit_seconds` does not; mujoco.sysid's own models are fitted without importing anything of this program.  Everyone is
-judged by plain C MuJoCo, at half a millisecond where the data allow it.  A program that has run is not run again.
+`fit_seconds` does not; mujoco.sysid's own models are fitted without importing anything of this program.  The judge is
+plain C MuJoCo: the door at half a millisecond, all else with the steps that a program fits with.  A program that has
+run is not run again.
 """
 
 from __future__ import annotations
