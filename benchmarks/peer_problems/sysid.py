@@ -105,7 +105,7 @@ def _residual(plain: Scene, space: Space, recording: Recording, channel: str) ->
     factors = servo_factors(plain, drive)
     state = sysid.create_initial_state(plain.model, drive.qpos0)
     control = sysid.TimeSeries(drive.time, drive.command)
-    measured = _measured(recording, channel)
+    measured = _measured(recording, channel, plain.joints)
     sequences = sysid.ModelSequences(
         recording.name, plain.spec, "repeats", state, control, measured, allow_missing_sensors=True
     )
@@ -155,12 +155,13 @@ def _noise(recording: Recording) -> float:
     return float(np.sqrt(np.nanmean((scatter / (np.linalg.norm(mean, axis=0) / np.sqrt(2))) ** 2)))
 
 
-def _measured(recording: Recording, name: str) -> Any:
-    """Its time series of a channel's mean over the repeats."""
+def _measured(recording: Recording, name: str, joints: Sequence[str]) -> Any:
+    """Its time series of a channel's mean over the repeats, of these joints."""
     sysid = library()
     channel = recording.channel(name)
-    mean = np.nanmean(np.where(channel.mask, channel.values, np.nan), axis=0)
-    names = {name: (sysid.SignalType.CustomObs, np.array([i])) for i, name in enumerate(channel.columns)}
+    columns = [channel.columns.index(joint) for joint in joints]
+    mean = np.nanmean(np.where(channel.mask, channel.values, np.nan), axis=0)[:, columns]
+    names = {name: (sysid.SignalType.CustomObs, np.array([i])) for i, name in enumerate(joints)}
     return sysid.TimeSeries(channel.time - recording.time[0], mean, signal_mapping=names)
 
 

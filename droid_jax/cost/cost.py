@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.arguments import instance, instances, one_of
-from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia
@@ -112,8 +112,7 @@ class Cost:
     def restated(self, values: np.ndarray) -> Cost:
         """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
         rollouts = [jax.tree.map(lambda a: a[0], r) for r in self.rollouts(values[None])]
-        made = [c.restated(r) if c.repeats == 1 else c for c, r in zip(self.comparisons, rollouts, strict=True)]
-        return self.compared_by(made)
+        return self.compared_by(restated(self.comparisons, rollouts))
 
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
         """The same compiled replays compared with other repeats of the same recordings, or in another way.

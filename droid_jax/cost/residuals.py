@@ -7,9 +7,11 @@ residuals, in units of the noise of the repeats' mean.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -136,19 +138,23 @@ class Comparison:
             parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
         return np.concatenate(parts, axis=1)
 
-    def restated(self, rollout: Rollout) -> Comparison:
-        """The comparison with a noise of every channel that a model's own rollout of one sample leaves plausible.
+    def unexplained(self, rollout: Rollout) -> dict[str, np.ndarray]:
+        """By channel, deviation [C] of a noise that a model's own rollout of one sample leaves plausible.
 
         One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
         """
 
-        def stated(channel: Measured) -> Measured:
+        def stated(channel: Measured) -> np.ndarray:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
             left = stated_deviation(left, channel.moves, self.config.noise.rate)
-            least = least_noise(channel.name, channel.noise.mean, self.config.noise)
-            return replace(channel, noise=channel.noise.stated(np.maximum(left, least)))
+            return np.maximum(left, least_noise(channel.name, channel.noise.mean, self.config.noise))
 
-        return replace(self, channels=tuple(stated(c) for c in self.channels))
+        return {channel.name: stated(channel) for channel in self.channels}
+
+    def stated(self, deviations: Mapping[str, np.ndarray]) -> Comparison:
+        """The comparison with a noise of every channel that has the deviation [C]."""
+        made = (replace(c, noise=c.noise.stated(deviations[c.name])) for c in self.channels)
+        return replace(self, channels=tuple(made))
 
     @property
     def leading(self) -> Measured:
@@ -201,6 +207,26 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
     measured = jnp.any(mask, axis=-1)
     samples = jnp.sum(measured, axis=1)  # [N], none where a repeat was not measured during the replay
     return jnp.sum(jnp.sum(norm * measured, axis=1) / jnp.maximum(samples, 1)) / jnp.maximum(jnp.sum(samples > 0), 1)
+
+
+def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> list[Comparison]:
+    """Comparisons with the noise of single repeats restated from what one sample's rollouts leave unexplained.
+
+    Recordings of the same columns share it, as their root mean square.  Each with its own, one that the model follows
+    badly would count for little, and one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or
+    0.095 rad as their search fell out, and together at 0.054.
+    """
+    single = [k for k, c in enumerate(comparisons) if c.repeats == 1]
+    left = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
+    alike = defaultdict[tuple[Any, ...], list[np.ndarray]](list)
+    for k in single:
+        for c in comparisons[k].channels:
+            alike[c.name, *c.columns.tolist()].append(left[k][c.name])
+    shared = {of: np.sqrt(np.mean(np.square(each), axis=0)) for of, each in alike.items()}
+    out = list(comparisons)
+    for k in single:
+        out[k] = out[k].stated({c.name: shared[c.name, *c.columns.tolist()] for c in out[k].channels})
+    return out
 
 
 def make_comparison(

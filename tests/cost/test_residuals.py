@@ -15,7 +15,7 @@ import pytest
 
 from droid_jax.cost import observation as measured
 from droid_jax.cost.replay_cache import Batched, cached
-from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene, compile_scene
@@ -365,12 +365,30 @@ def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene
     comparison = compare(scene, recording(*channels), channels={"torque": 1.0, "position": 1.0})
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = rollout(torque=rollout().torque + 0.5 * wave, position=rollout().position + 0.02 * wave)
-    restated = comparison.restated(tried)
-    torque, position = (1 / restated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
+    (stated,) = restated([comparison], [tried])
+    torque, position = (1 / stated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
     np.testing.assert_allclose(torque / position, 25.0, rtol=0.01)
     assert np.all(torque > 0.3)
-    shape = restated.channel("position").noise.whitener.shape
-    assert np.mean(np.asarray(restated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
+    shape = stated.channel("position").noise.whitener.shape
+    assert np.mean(np.asarray(stated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
+
+
+def test_recordings_of_the_same_columns_share_a_restated_noise(scene: Scene):
+    """One that the model follows badly counts as much for each radian as one that it follows well."""
+    logs = [compare(scene, recording(channel("torque", CLOCK, rollout().torque[None]))) for _ in range(3)]
+    repeated = compare(scene, recording(channel("torque", CLOCK, np.repeat(rollout().torque[None], 2, axis=0))))
+    wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
+    tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5, 0.7, 0.7)]
+    *of_logs, untouched = restated([*logs, repeated], tried)
+    whiteners = [c.channel("torque").noise.whitener for c in of_logs]
+    alone = [
+        1 / restated([c], [t])[0].channel("torque").noise.whitener[:, 0, 0] for c, t in zip(logs, tried, strict=False)
+    ]
+    assert alone[0] == pytest.approx(alone[2] / 7, rel=0.05)
+    shared = np.sqrt(np.mean(np.square(alone), axis=0))
+    for whitener in whiteners:
+        np.testing.assert_allclose(1 / whitener[:, 0, 0], shared, rtol=1e-6)
+    assert untouched is repeated
 
 
 def test_repeats_deviate_as_they_are_whitened(scene: Scene):
