@@ -224,13 +224,21 @@ def correlation_time(residuals: np.ndarray, rate: float = DEFAULT_NOISE.rate) ->
     return np.array(times)
 
 
+def deviation_of(residuals: np.ndarray, counts: np.ndarray | None = None) -> np.ndarray:
+    """[C] root mean square of residuals [K, C].
+
+    counts: [K, C] bool, the residuals that tell of noise; all unless given, and of a column that has none.
+    """
+    counts = np.ones(residuals.shape, bool) if counts is None else counts | ~counts.any(axis=0)
+    return np.sqrt(np.sum(np.where(counts, residuals, 0.0) ** 2, axis=0) / counts.sum(axis=0))
+
+
 def stated_deviation(
     residuals: np.ndarray, counts: np.ndarray | None = None, rate: float = DEFAULT_NOISE.rate
 ) -> np.ndarray:
     """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent.
 
-    counts: [K, C] bool, the residuals that tell of noise; all unless given, and of a column that has none.
+    counts: see `deviation_of`.
     """
-    counts = np.ones(residuals.shape, bool) if counts is None else counts | ~counts.any(axis=0)
-    rms = np.sqrt(np.sum(np.where(counts, residuals, 0.0) ** 2, axis=0) / counts.sum(axis=0))
+    rms = deviation_of(residuals, counts)
     return rms * np.sqrt(np.maximum(1.0, correlation_time(residuals, rate) * rate))

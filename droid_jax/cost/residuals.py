@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, weights
-from droid_jax.cost.noise import Noise, NoiseConfig, stated_deviation
+from droid_jax.cost.noise import Noise, NoiseConfig, deviation_of, stated_deviation
 from droid_jax.cost.observation import Measured, least_noise, prepared
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
@@ -138,18 +138,20 @@ class Comparison:
             parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
         return np.concatenate(parts, axis=1)
 
-    def unexplained(self, rollout: Rollout) -> dict[str, np.ndarray]:
-        """By channel, deviation [C] of a noise that a model's own rollout of one sample leaves plausible.
+    def unexplained(self, rollout: Rollout) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """By channel, root mean square [C] of what a model's own rollout of one sample leaves, and times [C] that it is
+        to be stated as noise, so that what is correlated counts as often as it is independent.
 
         One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
         """
 
-        def stated(channel: Measured) -> np.ndarray:
+        def of(channel: Measured) -> tuple[np.ndarray, np.ndarray]:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
-            left = stated_deviation(left, channel.moves, self.config.noise.rate)
-            return np.maximum(left, least_noise(channel.name, channel.noise.mean, self.config.noise))
+            moves, least = channel.moves, least_noise(channel.name, channel.noise.mean, self.config.noise)
+            rms = np.maximum(deviation_of(left, moves), least)
+            return rms, np.maximum(stated_deviation(left, moves, self.config.noise.rate), least) / rms
 
-        return {channel.name: stated(channel) for channel in self.channels}
+        return {channel.name: of(channel) for channel in self.channels}
 
     def stated(self, deviations: Mapping[str, np.ndarray]) -> Comparison:
         """The comparison with a noise of every channel that has the deviation [C]."""
@@ -212,20 +214,21 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
 def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> list[Comparison]:
     """Comparisons with the noise of single repeats restated from what one sample's rollouts leave unexplained.
 
-    Recordings of the same columns share it, as their root mean square.  Each with its own, one that the model follows
-    badly would count for little, and one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or
-    0.095 rad as their search fell out, and together at 0.054.
+    Recordings of the same columns share its root mean square.  Each with its own, one that the model follows badly
+    would count for little, and one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or 0.095
+    rad as their search fell out, and together at 0.054.
     """
     single = [k for k, c in enumerate(comparisons) if c.repeats == 1]
     left = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
     alike = defaultdict[tuple[Any, ...], list[np.ndarray]](list)
     for k in single:
         for c in comparisons[k].channels:
-            alike[c.name, *c.columns.tolist()].append(left[k][c.name])
+            alike[c.name, *c.columns.tolist()].append(left[k][c.name][0])
     shared = {of: np.sqrt(np.mean(np.square(each), axis=0)) for of, each in alike.items()}
     out = list(comparisons)
     for k in single:
-        out[k] = out[k].stated({c.name: shared[c.name, *c.columns.tolist()] for c in out[k].channels})
+        times = {name: factor for name, (_, factor) in left[k].items()}
+        out[k] = out[k].stated({c.name: shared[c.name, *c.columns.tolist()] * times[c.name] for c in out[k].channels})
     return out
 
 
