@@ -155,7 +155,7 @@ def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monk
     """Inside of the bounds; without it at the best of some draws."""
     begun = list[np.ndarray]()
 
-    def caught(log: WindowedLog, base: Space, effects: Any, end: float, config: Any, first: np.ndarray) -> None:
+    def caught(log: WindowedLog, base: Space, effects: Any, end: float, config: Any, first: Any, *more: Any) -> None:
         begun.append(log.space.select(base.names).to_search(first[log.space.columns(base)]))
         raise Caught
 
