@@ -214,9 +214,10 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
 def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> list[Comparison]:
     """Comparisons with the noise of single repeats restated from what one sample's rollouts leave unexplained.
 
-    Recordings of the same columns share its root mean square.  Each with its own, one that the model follows badly
-    would count for little, and one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or 0.095
-    rad as their search fell out, and together at 0.054.
+    Recordings of the same columns share half of its size: it is the geometric mean of what this one leaves and of what
+    all leave, as root mean squares.  Each with its own, one that the model follows badly would count for little, and
+    one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or 0.095 rad as their search fell out,
+    and so at 0.051 to 0.054.  With all of it shared, the log that is followed worst would decide.
     """
     single = [k for k, c in enumerate(comparisons) if c.repeats == 1]
     left = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
@@ -227,8 +228,11 @@ def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> 
     shared = {of: np.sqrt(np.mean(np.square(each), axis=0)) for of, each in alike.items()}
     out = list(comparisons)
     for k in single:
-        times = {name: factor for name, (_, factor) in left[k].items()}
-        out[k] = out[k].stated({c.name: shared[c.name, *c.columns.tolist()] * times[c.name] for c in out[k].channels})
+        sizes = dict[str, np.ndarray]()
+        for c in out[k].channels:
+            own, times = left[k][c.name]
+            sizes[c.name] = np.sqrt(own * shared[c.name, *c.columns.tolist()]) * times
+        out[k] = out[k].stated(sizes)
     return out
 
 
