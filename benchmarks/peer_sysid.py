@@ -27,7 +27,7 @@ import json  # noqa: E402
 import tyro  # noqa: E402
 
 from benchmarks.common import commits, origin, publish, stem  # noqa: E402
-from benchmarks.peer_problems import doors, springs, sysid, test_models  # noqa: E402
+from benchmarks.peer_problems import doors, springs, sysid, sysid_models  # noqa: E402
 from benchmarks.sharing import kept  # noqa: E402
 
 Case = Callable[[], dict[str, Any]]
@@ -50,8 +50,8 @@ def cases(quick: bool) -> dict[str, Case]:
     out: dict[str, Case] = {}
     steps = {
         "own_data": (0.002, 0.002),
-        "real_2ms": (test_models.FINE, 0.002),
-        "real_half_ms": (test_models.FINE, 0.0005),
+        "real_2ms": (sysid_models.FINE, 0.002),
+        "real_half_ms": (sysid_models.FINE, 0.0005),
     }
     for problem in ("spring",) if quick else ("spring", "arm"):
         for name, (data, fit) in list(steps.items())[: 1 if quick else None]:

@@ -29,7 +29,6 @@ import json  # noqa: E402
 import shutil  # noqa: E402
 import subprocess  # noqa: E402
 import time  # noqa: E402
-from collections.abc import Callable  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
 from typing import Any  # noqa: E402
 
@@ -40,7 +39,7 @@ from real_so101 import FIT, JUDGED, JUDGES, scene_of, so101_log  # noqa: E402
 from xl330_logs import GAINS, MOTIONS, xl330_log  # noqa: E402
 
 from benchmarks.common import publish, stem  # noqa: E402
-from benchmarks.peer_problems import doors, springs, test_models  # noqa: E402
+from benchmarks.peer_problems import doors, springs, sysid_models  # noqa: E402
 from benchmarks.peer_problems.programs import DOOR, PROBLEM, PROGRAMS, problem  # noqa: E402
 from droid_jax.cost.residuals import CompareConfig  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
@@ -81,24 +80,24 @@ class Logs:
     judge: list[Recording]
     asked: dict[str, Any]
     files: dict[str, Path | str]
+    rows: dict[str, Any] | None = None  # what is fitted, for a program that reads no recording
 
 
 def own_model(name: str) -> Logs:
     """One of mujoco.sysid's tests."""
-    spec = test_models.spec_of(name)
+    spec = sysid_models.spec_of(name)
     spec.option.timestep = STEP
     model = spec.compile()
     joints = [model.joint(i).name for i in range(model.njnt)]
-    fit, judge = (
-        springs.driven_log(role, joints, test_models.log_of(name, role == "judge", test_models.FINE, STEP))
-        for role in ("fit", "judge")
-    )
+    rows: list[dict[str, Any]] = [sysid_models.log_of(name, judge, sysid_models.FINE, STEP) for judge in (False, True)]
+    fit, judge = (springs.driven_log(role, joints, of) for role, of in zip(("fit", "judge"), rows, strict=True))
     entries = [
         {**entry, **({"element": joints, "each": True} if entry["element"] == "*" else {})}
-        for entry in test_models.PARAMETERS[name]
+        for entry in sysid_models.PARAMETERS[name]
     ]
     files = {"scene.xml": spec.to_xml(), "parameters.json": json.dumps(entries)}
-    return Logs([fit], [judge], {"joints": joints, "channels": ["position"], "refinement_only": True}, files)
+    asked = {"joints": joints, "channels": ["position"], "refinement_only": True}
+    return Logs([fit], [judge], asked, files, rows[0])
 
 
 def real_logs(name: str, data: Path, quick: bool) -> Logs:
@@ -148,9 +147,8 @@ def prepared(name: str, arguments: Arguments, folder: Path) -> None:
             save_recording(recording, folder / f"{role}_{number}.npz")
     for file, content in logs.files.items():
         shutil.copy(content, folder / file) if isinstance(content, Path) else (folder / file).write_text(content)
-    if name in test_models.PARAMETERS:
-        rows: dict[str, Any] = test_models.log_of(name, False, test_models.FINE, STEP)
-        np.savez(folder / "fit.npz", **rows)
+    if logs.rows is not None:
+        np.savez(folder / "fit.npz", **logs.rows)
     asked = {"scene": "scene.xml", "parameters": "parameters.json", **(QUICK if arguments.quick else BUDGET)}
     names = {role: [f"{role}_{k}" for k in range(len(some))] for role, some in
              (("fit", logs.fit), ("judge", logs.judge))}  # fmt: skip
@@ -159,9 +157,9 @@ def prepared(name: str, arguments: Arguments, folder: Path) -> None:
 
 def fitted(name: str, program: str, folder: Path) -> dict[str, Any]:
     """What a program found, with the seconds of its process."""
-    path, alone = folder / f"{program}.json", name in test_models.PARAMETERS and program == "sysid"
+    path, alone = folder / f"{program}.json", name in sysid_models.PARAMETERS and program == "sysid"
     if not path.is_file() or "seconds" not in json.loads(path.read_text()):
-        module = "test_models" if alone else "programs"
+        module = "sysid_models" if alone else "programs"
         command = [sys.executable, "-m", f"benchmarks.peer_problems.{module}", str(folder.resolve())]
         began = time.monotonic()
         subprocess.run([*command, *([] if alone else [program])], cwd=ROOT, check=True)
@@ -203,8 +201,7 @@ def figures(name: str, folder: Path) -> dict[str, Any]:
         }
         for program, one in found.items()
     }
-    for key in ("seconds", "fit_seconds"):
-        ratio = "time_ratio_to_sysid" if key == "seconds" else "fit_time_ratio_to_sysid"
+    for key, ratio in {"seconds": "time_ratio_to_sysid", "fit_seconds": "fit_time_ratio_to_sysid"}.items():
         out[ratio] = found["ours"][key] / found["sysid"][key]
     return {**out, **({"heldout_of_truth": left["truth"]} if "truth" in left else {})}
 
@@ -219,20 +216,21 @@ def _inside(folder: Path, one: dict[str, Any]) -> list[int]:
 
 
 def main(arguments: Arguments) -> None:
-    """All programs on all problems, each written down as soon as it is known."""
-    there: Callable[[str], bool] = lambda name: name in SYNTHETIC or arguments.data is not None  # noqa: E731
-    every = ("spring", "go2") if arguments.quick else (*SYNTHETIC, *REAL)
-    if unknown := [p for p in arguments.problems if p not in (*SYNTHETIC, *REAL)]:
-        raise SystemExit(f"error: no problem {', '.join(unknown)}; there are {', '.join((*SYNTHETIC, *REAL))}")
+    """All programs on all problems; those that an earlier run left in peers.json stay in it."""
+    every = (*SYNTHETIC, *REAL)
+    if unknown := [p for p in arguments.problems if p not in every]:
+        raise SystemExit(f"error: no problem {', '.join(unknown)}; there are {', '.join(every)}")
+    usual = ("spring", "go2") if arguments.quick else every
     runs = arguments.out / stem("peers_runs", arguments.quick)
     path = arguments.out / f"{stem('peers', arguments.quick)}.json"
-    known = json.loads(path.read_text()).get("problems", {}) if path.is_file() else {}
-    for name in arguments.problems or [p for p in every if there(p)]:
+    there = json.loads(path.read_text()) if path.is_file() else {}
+    known = {name: there[name] for name in every if name in there}
+    for name in arguments.problems or [p for p in usual if p in SYNTHETIC or arguments.data is not None]:
         print(f"{name} ...", flush=True)
         prepared(name, arguments, runs / name)
         known[name] = figures(name, runs / name)
         print(json.dumps(known[name]), flush=True)
-    publish(arguments.out, "peers", arguments.quick, 0, {"programs": list(PROGRAMS), "problems": known, **known})
+    publish(arguments.out, "peers", arguments.quick, 0, {"programs": list(PROGRAMS), **known})
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benchmarks.peer_problems import test_models as models
+from benchmarks.peer_problems import sysid_models as models
 from benchmarks.peer_problems.gap import run_gap
 from droid_jax.cost.cost import ENGINES, make_cost
 from droid_jax.cost.residuals import CompareConfig
@@ -91,7 +91,7 @@ def unknowns(name: str, scene: Scene) -> tuple[Space, np.ndarray]:
 
 
 def driven_log(name: str, joints: Sequence[str], rows: Mapping[str, np.ndarray]) -> Recording:
-    """Rows of `test_models.log_of` as two equal repeats, as without noise all are."""
+    """Rows of `sysid_models.log_of` as two equal repeats, as without noise all are."""
     names, clock = tuple(joints), rows["time"]
 
     def channel(name: str, unit: str, values: np.ndarray) -> Channel:

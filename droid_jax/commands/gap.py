@@ -167,7 +167,7 @@ def run(command: GapCommand) -> None:
     then = "; then first fits, which tell the noise" if split is Split.WINDOWS else ""
     print(f"compiling the replay{then} ...", flush=True)
     began = time.monotonic()
-    with stages(("first_fits",)) as show:
+    with stages(("first_fits",) if then else ()) as show:
         case = case_of(split, scene, base, effects, roles, config, start, lambda now: show("first_fits", now))
     preparation = time.monotonic() - began
     begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good

@@ -139,17 +139,17 @@ class Comparison:
         return np.concatenate(parts, axis=1)
 
     def unexplained(self, rollout: Rollout) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """By channel, root mean square [C] of what a model's own rollout of one sample leaves, and times [C] that it is
-        to be stated as noise, so that what is correlated counts as often as it is independent.
+        """By channel, root mean square [C] of what a model's own rollout of one sample leaves, and the deviation [C] to
+        state as its noise (`stated_deviation`).
 
         One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
         """
 
         def of(channel: Measured) -> tuple[np.ndarray, np.ndarray]:
             left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
-            moves, least = channel.moves, least_noise(channel.name, channel.noise.mean, self.config.noise)
-            rms = np.maximum(deviation_of(left, moves), least)
-            return rms, np.maximum(stated_deviation(left, moves, self.config.noise.rate), least) / rms
+            least = least_noise(channel.name, channel.noise.mean, self.config.noise)
+            both = deviation_of(left, channel.moves), stated_deviation(left, channel.moves, self.config.noise.rate)
+            return np.maximum(both[0], least), np.maximum(both[1], least)
 
         return {channel.name: of(channel) for channel in self.channels}
 
@@ -228,11 +228,8 @@ def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> 
     shared = {of: np.sqrt(np.mean(np.square(each), axis=0)) for of, each in alike.items()}
     out = list(comparisons)
     for k in single:
-        sizes = dict[str, np.ndarray]()
-        for c in out[k].channels:
-            own, times = left[k][c.name]
-            sizes[c.name] = np.sqrt(own * shared[c.name, *c.columns.tolist()]) * times
-        out[k] = out[k].stated(sizes)
+        common = {c.name: shared[c.name, *c.columns.tolist()] for c in out[k].channels}
+        out[k] = out[k].stated({name: alone * np.sqrt(common[name] / rms) for name, (rms, alone) in left[k].items()})
     return out
 
 

@@ -260,7 +260,12 @@ def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
     named = {key.effect for effects, _ in answers for key in effects}
     named |= {key.effect for _, each in answers for alternatives in each for keys in alternatives for key in keys}
     return {
-        e.name: {"what": e.description, "signature": e.signature, "confused_with": list(e.confused_with)}
+        e.name: {
+            "what": e.description,
+            "signature": e.signature,
+            "confused_with": list(e.confused_with),
+            **({"remedy": e.remedy} if e.remedy else {}),
+        }
         for e in case.effects
         if e.name in named
     }

@@ -88,6 +88,7 @@ class Effect:
     For the gap search:
     description, signature:   a sentence each: what it is, and where its mark should appear.
     confused_with: names of effects that look alike on some data.
+    remedy: what to do, where the simulator is at fault and nothing on the robot.
     special_cases:        names of effects that are special cases of it, or nearly so over the range of a motion:
                   where one of them is equivalent, this one is dominated.
     locations:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
@@ -111,6 +112,7 @@ class Effect:
     description: str = ""
     signature: str = ""
     confused_with: tuple[str, ...] = ()
+    remedy: str = ""
     special_cases: tuple[str, ...] = ()
     locations: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     shape_parameters: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

@@ -75,6 +75,7 @@ class About(Struct, frozen=True):
     what: str
     signature: str
     confused_with: list[str]
+    remedy: str = ""
 
 
 class Ranked(Placed, frozen=True, kw_only=True):

@@ -71,7 +71,7 @@ def gap_doubts(gap: Gap) -> list[str]:
     asked = {
         "validation_chose": "test" not in gap.roles and not gap.lost,
         "test_lost": gap.lost,
-        "test_worse": test_worse(gap),
+        "test_worse": worse_on_test(gap),
         "limits": bool(gap.found.split.limits),
         "coarse": coarse_share(gap) is not None,
         "step_unknown": gap.found.discretisation_error is None,
@@ -84,7 +84,7 @@ def gap_doubts(gap: Gap) -> list[str]:
     return [name for name, holds in asked.items() if holds]
 
 
-def test_worse(gap: Gap) -> bool:
+def worse_on_test(gap: Gap) -> bool:
     """Whether a model with effects does worse than the base model on the recordings that no fit saw."""
     test = gap.found.discrepancies.get("test")
     return gap.extended and test is not None and test.closed is not None and test.closed < 0
@@ -125,9 +125,12 @@ def gap_next_step(gap: Gap) -> str:
         if gap.found.hints:
             return "hints"
         return "none passed clearly" if any(t.passed for t in gap.found.validation_tests) else "none passed"
-    if verdict == "named" and {e.effect for e in gap.found.effects} == {"soft_friction"}:
-        return "named in the simulator"
-    return verdict
+    return "named in the simulator" if verdict == "named" and in_the_simulator(gap) else verdict
+
+
+def in_the_simulator(gap: Gap) -> bool:
+    """Whether no named effect has its cause on the robot: each comes with a remedy in the model."""
+    return all((about := gap.found.about.get(e.effect)) and about.remedy for e in gap.found.effects)
 
 
 def best_experiment(gap: Gap) -> ExperimentEntry | None:

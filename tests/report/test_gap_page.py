@@ -198,7 +198,9 @@ def test_a_model_that_does_worse_on_the_test_recording_is_doubted(made: Callable
 
 
 def test_friction_that_creeps_is_mended_in_the_mjcf(made: Callable) -> None:
-    gap, written = made("named", effects=[{"effect": "soft_friction", "location": "all joints"}])
+    remedy = "take solimpfriction from extended.patch"
+    about = {"soft_friction": {"what": "", "signature": "", "confused_with": [], "remedy": remedy}}
+    gap, written = made("named", effects=[{"effect": "soft_friction", "location": "all joints"}], about=about)
     assert gap_next_step(gap) == "named in the simulator"
     assert "solimpfriction" in written.ids["gap-next"]["text"] and "hardware" in written.ids["gap-next"]["text"]
 

@@ -122,6 +122,7 @@ def test_joints_that_creep_may_all_be_asked_about_together():
     motors = "".join(f"<motor joint='{j}'/>" for j in "abc")
     spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{chain}</worldbody><actuator>{motors}</actuator></mujoco>")
     (effect,) = library(compile_scene(spec, "chain", joints=list("abc")), ["soft_friction"])
+    assert "solimpfriction" in effect.remedy
     one, other = (f"friction_firmness[{j}]" for j in "ab")
     assert effect.locations == {"a": (one,), "b": (other,), "all joints": (one, other)}
     assert effect.natural_bounds == (one, other)

@@ -1,6 +1,6 @@
 """The two models of mujoco.sysid's own tests, and its fit of them: without anything of this program, nor jax.
 
-    python -m benchmarks.peer_problems.test_models FOLDER
+    python -m benchmarks.peer_problems.sysid_models FOLDER
 
 fits the log in FOLDER/fit.npz and writes FOLDER/sysid.json, as a process of its own whose time counts.
 """
