@@ -71,7 +71,8 @@ def empty_cache(folder: str) -> dict[str, str]:
     Without the log level that an imported jax leaves behind, under which XLA says more than in a fresh terminal.
     """
     given = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
-    return {**given, runtime.CACHE_VARIABLE: f"{folder}/cache", "PYTHONPATH": str(ROOT)}
+    path = os.pathsep.join(filter(None, (str(ROOT), given.get("PYTHONPATH"))))
+    return {**given, runtime.CACHE_VARIABLE: f"{folder}/cache", "PYTHONPATH": path}
 
 
 def interleave(

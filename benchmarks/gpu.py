@@ -13,7 +13,7 @@ measured, and the others go on:
 | part | measures |
 |---|---|
 | c | physics steps per second of the door in the C engine, on all cores of this machine |
-| jax | the same of this program's replay, populations 32 to 16384 |
+| jax | the same of this program's replay, populations 32 to 65536, compiled side by side |
 | warp | the same of mjx.step with MuJoCo Warp (`mjx.put_model(impl="warp")`), or why there is none |
 | fit | a CMA-ES search of the paper's size: 30 samples, 100 generations, one opening |
 | ppo | training of the preset "gpu": simulation steps per second, time to 95 % success |
@@ -35,6 +35,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,9 +49,9 @@ from benchmarks.common import CODE, empty_cache, origin, peak_memory_gib, stem  
 from droid_jax import runtime  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
-SHARES = {"c": 1.0, "jax": 5.0, "warp": 3.0, "fit": 3.0, "ppo": 4.0, "gap": 4.0}  # of the time, in this order
-POPULATIONS = (1024, 4096, 16384, 32, 256, 8192, 2048, 512, 128, 64)  # the most telling first
-WARP_POPULATIONS = (1024, 4096, 16384, 256)
+SHARES = {"c": 1.0, "jax": 5.0, "warp": 4.0, "fit": 3.0, "ppo": 6.0, "gap": 4.0}  # of the time, in this order
+POPULATIONS = (32, 256, 1024, 4096, 16384, 65536)
+WARP_POPULATIONS = (1024, 16384, 256, 4096)
 STEPS, QUICK_STEPS = 1000, 50  # of 2 ms
 QUICK_SECONDS = 5.0  # of a demonstration: the door moves in it
 REPEATS = 2  # timed calls, after one that compiles
@@ -71,11 +72,13 @@ class Arguments:
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of gpu.json."""
     only: tuple[str, ...] = tuple(SHARES)
-    """Parts."""
+    """Parts; what an earlier run of the same code and samples measured of the others stays."""
     seconds: float | None = None
     """For all parts together; default: 480, with --quick 220."""
     seed: int = 0
     """Of the samples, the search, the robot and the policy."""
+    commit: str = CODE.get("git", "")
+    """Of the code, where no git can say it."""
     part: str = ""
     """Run this part in this process, and write to --kept: how the script calls itself."""
     kept: Path = Path()
@@ -141,7 +144,7 @@ def of_jax(now: Measuring) -> None:
     import replays
 
     case = replays.make_case(now.arguments.seed, _steps(now))
-    _throughput(now, case.steps, POPULATIONS, lambda population: replays.as_one_block(case, population))
+    _throughput(now, case.steps, POPULATIONS, lambda population: replays.as_one_block(case, population), True)
 
 
 def of_warp(now: Measuring) -> None:
@@ -185,22 +188,41 @@ def _warp(case: Any, population: int) -> Callable[[], Any]:
 
 
 def _throughput(
-    now: Measuring, steps: int, populations: Sequence[int], make: Callable[[int], Callable[[], Any]]
+    now: Measuring,
+    steps: int,
+    populations: Sequence[int],
+    make: Callable[[int], Callable[[], Any]],
+    side_by_side: bool = False,
 ) -> None:
+    """Each population's speed.  side_by_side: of the first calls, which compile."""
     from common import interleave
 
+    asked = (32, 64) if now.arguments.quick else populations
+    runs = {population: make(population) for population in asked}
+    compiled: dict[int, float] = {}
+    failed: dict[int, str] = {}
+    with ThreadPoolExecutor(len(runs) if side_by_side else 1) as pool:
+        firsts = {pool.submit(_timed, run): population for population, run in runs.items()}
+        for done in as_completed(firsts):
+            try:
+                compiled[firsts[done]] = done.result()
+            except Exception as error:  # out of memory at the largest: the others stay
+                failed[firsts[done]] = f"{type(error).__name__}: {error!s:.300}"
+                now.keep(failed=failed)
+            else:
+                now.keep(first_call_s=compiled)
     rows = []
-    for population in now.while_there_is_time((32, 64) if now.arguments.quick else populations):
-        try:
-            first, median = interleave({"run": make(population)}, REPEATS)
-        except Exception as error:  # out of memory at the largest: the others stay
-            rows.append({"population": population, "error": f"{type(error).__name__}: {str(error)[:300]}"})
-        else:
-            seconds = median["run"]
-            row = {**_row(population, steps, seconds), "compile_s": max(0.0, first["run"] - seconds)}
-            rows.append({**row, "peak_gib": peak_memory_gib()})
-        whole = [row["steps_per_s"] for row in rows if "steps_per_s" in row]
-        now.keep(rows=sorted(rows, key=lambda row: row["population"]), steps_per_s=max(whole, default=None))
+    for population in sorted(compiled):
+        _, median = interleave({"run": runs[population]}, REPEATS)
+        rows.append({**_row(population, steps, median["run"]), "peak_gib": peak_memory_gib()})
+        now.keep(rows=rows, steps_per_s=max(row["steps_per_s"] for row in rows))
+
+
+def _timed(run: Callable[[], Any]) -> float:
+    """s of one call."""
+    began = time.monotonic()
+    run()
+    return time.monotonic() - began
 
 
 def of_fit(now: Measuring) -> None:
@@ -393,7 +415,9 @@ def main() -> None:
     parts: dict[str, dict[str, Any]] = {}
     path = arguments.out / f"{stem('gpu', arguments.quick)}.json"
     asked = [part for part in SHARES if part in arguments.only]
-    machine = {"quick": arguments.quick, "commit": CODE.get("git"), "seed": arguments.seed}
+    machine = {"quick": arguments.quick, "commit": arguments.commit, "seed": arguments.seed}
+    if path.is_file() and (earlier := json.loads(path.read_text())).items() >= machine.items():
+        parts |= earlier["parts"]
     with tempfile.TemporaryDirectory(prefix="gpu_") as cache:
         for number, part in enumerate(asked):
             left = arguments.limit - (time.monotonic() - began)
@@ -404,7 +428,7 @@ def main() -> None:
                 f"{part}: {parts[part]['part_s']:.0f} s of {share:.0f}, {parts[part].get('error', 'done')}", flush=True
             )
     seconds = time.monotonic() - began  # the device is asked only now: its memory was the parts' own
-    result = {**headline(parts), **machine, **origin(arguments.seed), "seconds": seconds, "parts": parts}
+    result = {**headline(parts), **origin(arguments.seed), **machine, "seconds": seconds, "parts": parts}
     write_json(path, result, indent=2)
     print(json.dumps({**headline(parts), "device": result["device"], "seconds": seconds}))
 

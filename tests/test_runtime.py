@@ -187,6 +187,15 @@ def test_mesh_spans_all_devices_of_the_process():
     np.testing.assert_allclose(jax.jit(total)(x), x.sum())
 
 
+def test_products_are_exact_unless_the_user_decided(tmp_path):
+    """In processes of their own: the setting is the whole program's."""
+    code = "from droid_jax import runtime; runtime.tune(); import jax; print(jax.config.jax_default_matmul_precision)"
+    for given, expected in ({}, "highest"), ({"JAX_DEFAULT_MATMUL_PRECISION": "tensorfloat32"}, "tensorfloat32"):
+        environment = {**os.environ, runtime.CACHE_VARIABLE: str(tmp_path), **given}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        assert run.stdout.split()[-1] == expected
+
+
 def test_no_cpu_options_on_another_backend(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert runtime.compiler_options() == {}

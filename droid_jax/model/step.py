@@ -32,6 +32,7 @@ from droid_jax.model.mjx_internals import (
     midpoint_constraints,
     with_constraint_force,
 )
+from droid_jax.model.normal_equations import normal_equations
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.unsupported_features import check_options
 
@@ -177,8 +178,7 @@ def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
     jacobian, weight = rows.jacobian, rows.weight
     low, high = _force_bounds(rows)
     exact = firm and weight.shape[0] <= EXACT_ROWS
-    products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(inertia.shape[0])], axis=1)
-    entry = _packed_index(inertia.shape[0])
+    of_weights, solved = normal_equations(jacobian)
 
     def forces(residual: jax.Array) -> tuple[jax.Array, jax.Array]:
         """[rows] forces and curvatures at J a - aref."""
@@ -189,9 +189,8 @@ def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
     def iterate(carry):
         qacc, residual, force, curvature, count, _ = carry
         pull = _times(inertia, qacc) - data.qfrc_smooth
-        hessian = inertia + (curvature @ products)[entry]
-        factor = jax.lax.linalg.cholesky(hessian, symmetrize_input=False)
-        change = _solve_factored(factor, _times(jacobian.T, force) - pull)
+        hessian = inertia + of_weights(curvature)
+        change = solved(hessian, _times(jacobian.T, force) - pull)
         along = _times(jacobian, change)
         slopes = _dot(pull, change), _dot(change, _times(inertia, change))
         if exact:
@@ -235,20 +234,6 @@ def _force_bounds(rows: ConstraintRows) -> tuple[jax.Array, jax.Array]:
     loss = rows.friction
     low = jnp.where(equality, -jnp.inf, jnp.where(dry, -loss, 0.0))
     return low, jnp.where(dry, loss, jnp.inf)
-
-
-def _packed_index(size: int) -> np.ndarray:
-    """[size, size] place of each entry in a symmetric matrix's packed upper triangle."""
-    entry = np.zeros((size, size), dtype=int)
-    row, column = np.triu_indices(size)
-    entry[row, column] = entry[column, row] = np.arange(len(row))
-    return entry
-
-
-def _solve_factored(factor: jax.Array, right: jax.Array) -> jax.Array:
-    """x of L L^T x = right, from the lower factor L."""
-    half = jax.lax.linalg.triangular_solve(factor, right[:, None], left_side=True, lower=True)
-    return jax.lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
 
 
 def _line_search(

@@ -67,7 +67,8 @@ def over_block(function: Callable[..., Any], alike: bool = True) -> Callable[...
     rows = PartitionSpec(AXIS)
 
     def block(values: jax.Array, more: tuple[Any, ...]) -> Any:
-        return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
+        with jax.default_matmul_precision(runtime.PRODUCTS):  # also for a caller without `runtime.tune`
+            return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
 
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
     specs = rows, PartitionSpec() if alike else rows

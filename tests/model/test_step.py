@@ -14,6 +14,7 @@ import pytest
 from mujoco import mjx
 
 from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows, exact_segments, midpoint_law
+from droid_jax.model.normal_equations import UNROLLED, normal_equations
 from droid_jax.model.step import simulate_step, solve
 from droid_jax.model.unsupported_features import check_options
 
@@ -205,6 +206,28 @@ def test_any_warm_start_ends_at_the_same_place(case):
 def test_the_warm_start_of_the_answer_stays_there(case):
     _, _, qpos, qvel, run, (qacc, _, _) = case
     assert error(np.asarray(run(qpos, qvel, qacc.astype(np.float32))[0][0]), qacc).max() < QACC_TOLERANCE
+
+
+@pytest.mark.parametrize("size", [1, 3, 8, UNROLLED, UNROLLED + 1])
+def test_a_gpu_solves_the_same_systems(monkeypatch, size: int):
+    """Its way of building and solving them, run on a CPU, against float64: stiff rows beside soft ones."""
+    rng = np.random.default_rng(size)
+    jacobian, weights = rng.normal(size=(5, 20, size)), 10.0 ** rng.uniform(-2, 3, (5, 20))
+    inertia, right = np.eye(size) * rng.uniform(0.1, 2.0, size), rng.normal(size=(5, size))
+    matrix = inertia + np.einsum("bri,br,brj->bij", jacobian, weights, jacobian)
+
+    def change(jacobian: jax.Array, weights: jax.Array, right: jax.Array) -> tuple[jax.Array, jax.Array]:
+        of_weights, solved = normal_equations(jacobian)
+        whole = jnp.asarray(inertia, jnp.float32) + of_weights(weights)
+        return whole, solved(whole, right)
+
+    for backend in ("cpu", "gpu"):
+        with monkeypatch.context() as patch:
+            patch.setattr(jax, "default_backend", lambda backend=backend: backend)
+            built, found = jax.vmap(change)(*(jnp.asarray(a, jnp.float32) for a in (jacobian, weights, right)))
+        np.testing.assert_allclose(built, matrix, rtol=1e-5, atol=1e-5 * np.abs(matrix).max())
+        left = np.einsum("bij,bj->bi", np.asarray(built, float), np.asarray(found, float)) - right
+        assert np.abs(left).max() < 2e-3 * np.abs(right).max(), backend
 
 
 # ----- firm friction: its part of the slope along a step is steep and narrow, and many rows have such a part
