@@ -264,11 +264,12 @@ def of_ppo(now: Measuring) -> None:
 
     def tell(at: TrainProgress) -> None:
         history.append(at)
-        rates = [h.rate for h in history[2:]] or [history[-1].rate]
+        rates = [h.rate for h in history[2:]]  # before, it compiled
+        rate = sum(rates) / len(rates) if rates else None
         there = [h for h in history if h.success >= ENOUGH]
         now.keep(
-            actions_per_s=sum(rates) / len(rates),
-            steps_per_s=physics * sum(rates) / len(rates),
+            actions_per_s=rate,
+            steps_per_s=None if rate is None else physics * rate,
             seconds_to_95=there[0].seconds if there else None,
             first_evaluation_s=history[0].seconds,
             history=[asdict(h) for h in history],

@@ -84,8 +84,8 @@ class Identify:
     """Python file that registers effects of your own (docs/your-effect.md); it is run."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: compiled, all devices.  mujoco: plain C, all cores; of commanded logs for motor-side torques, without
-    gravity where the scene compensates it.  auto: plain C for commanded recordings of one repeat, on a CPU, where C can
-    replay them; else MJX."""
+    gravity where the scene compensates it.  auto: plain C for commanded recordings of one repeat, where C can
+    replay them (beside a GPU in small batches alone); else MJX."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None

@@ -253,7 +253,7 @@ def prepare(
     full = space if nuisances is None or config.refine is None else space + nuisances
     engine = EngineChoice(config.engine, "as asked for")
     if config.engine == "auto":
-        engine = choose_engine(scene, full, [*recordings, *judges], effects)
+        engine = choose_engine(scene, full, [*recordings, *judges], effects, config.search.population)
     base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
     if len(chosen) > 1:
         config = replace(config, compare=replace(config.compare, channels=in_noise_units(base, full.mean)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from two_link import JOINTS, arm, recording
 
-from droid_jax import distributed
+from droid_jax import distributed, runtime
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.model.effects.registry import effect_space, library
@@ -48,8 +48,14 @@ def test_parameters_and_effects_of_sensors_are_replayed_in_mjx():
 def test_other_machines_are_mjx(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(distributed, "count", lambda: 2)
     assert choose_engine(arm(), SPACE, [ONE]).engine == "mjx"
+
+
+def test_a_gpu_takes_what_is_too_much_for_the_cores_beside_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert "gpu" in choose_engine(arm(), SPACE, [ONE]).why
+    monkeypatch.setattr(runtime, "cores", lambda: 4)
+    few, many = (choose_engine(arm(), SPACE, [ONE], samples=samples) for samples in (64, 65))
+    assert (few.engine, many.engine) == ("mujoco", "mjx") and "gpu" in many.why and "64 samples" in few.why
+    assert choose_engine(arm(), SPACE, [recording()], samples=1).engine == "mjx"
 
 
 def test_c_draws_a_servos_own_profile():
