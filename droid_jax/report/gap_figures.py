@@ -39,6 +39,7 @@ U_LABEL = "Discrepancy U [σ²]"
 MODELS = ("base model", "final model")
 SCATTERS = 2.0  # half width of the band, in deviations of the repeats
 POINTS = 60  # buckets of a line: fourteen panels must fit into the page as SVG
+TINY = 0.01  # share of the smallest bar below which the discretisation error would only stretch the axis
 BAND = "±2 deviations of the repeats"
 _BLANK: dict[str, Any] = {"facecolor": "none", "edgecolor": LINE, "hatch": "////", "linewidth": 0}
 
@@ -77,7 +78,9 @@ def _pairs(
 ) -> None:
     """Bars side by side, their numbers above them; a value at or below zero has its number at the bottom."""
     table = as_floats(values)[: 2 if extended else 1]
-    scale(axes, table.ravel().tolist() + ([] if error is None else [error]))
+    least = np.min(table[table > 0], initial=np.inf)
+    tiny = error is not None and error < TINY * least
+    scale(axes, table.ravel().tolist() + ([] if error is None or tiny else [error]))
     step, size = (0.4, 0.36) if extended else (0.0, 0.5)
     for i, (row, name, colour) in enumerate(zip(table, MODELS, (BEFORE, AFTER), strict=False)):
         x = np.arange(len(names)) + (i - 0.5) * step
@@ -94,7 +97,7 @@ def _pairs(
                 fontsize=7.5,
             )
     if error is not None:
-        text = f"discretisation error {significant(error)}"
+        text = f"discretisation error {significant(error)}" + (" (below the axis)" if tiny else "")
         axes.axhline(error, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label=text)
     axes.set_xticks(range(len(names)), names)
     axes.set_xlim(-0.6, len(names) - 0.4)

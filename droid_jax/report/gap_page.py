@@ -5,6 +5,7 @@ templates/gap.html.jinja lays it out, templates/gap_sentences.jinja has the sent
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from droid_jax.report.gap_folder import (
 )
 from droid_jax.report.style import Drawing
 
+NAME = 18  # characters in a line of a recording's name under its bars
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between indistinguishable models
 COARSE = 0.1  # share of U that is the discretisation error, from which the page warns
 UNCERTAIN = 0.8  # share of what is left on the validation recording beyond the fit's uncertainty, from which it is real
@@ -297,7 +299,8 @@ def _draw(gap: Gap) -> dict[str, list[Drawing]]:
     def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
         sections[section].append(style.drawing(gap.folder, f"missing_{stem}", title, make, *args))
 
-    names = [f"{gap.recording(role)}\n{ROLES[role]}" for role in gap.roles]
+    lines = [textwrap.fill(gap.recording(role), NAME, max_lines=3, placeholder=" …") for role in gap.roles]
+    names = [f"{name}\n{ROLES[role]}" for name, role in zip(lines, gap.roles, strict=True)]
     sizes = [found.discrepancies[role] for role in gap.roles]
     bars = (names, sizes, gap.discretisation_error, found.distance, extended)
     add("size", "gap", f"Discrepancy and {found.distance[0].lower()}", gap_figures.discrepancy_bars, *bars)
