@@ -146,25 +146,32 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     name, quick = stem("default_run", arguments.quick), arguments.quick
     out, other = arguments.out / name, arguments.against
-    paired = dict[str, Any]()
+    written, paired = arguments.out / f"{name}.json", dict[str, Any]()
     if other is not None:
         paired["against"] = of_another_commit(other, out, quick)
+        write_json(written, paired)  # each run takes half an hour or more: what is there stays
     with tempfile.TemporaryDirectory() as cache:
         lines = shown(command_lines(out, cache), quick)
+        found: dict[str, Any] = {"help_s": help_seconds(), **figures(lines), **({} if quick else results(out))}
+        found["printed"] = [[round(line.seconds, 1), line.text] for line in lines]
+        write_json(written, found | paired | ratios(found, paired))
         if other is not None:
             with tempfile.TemporaryDirectory() as folder:
                 paired["warm"] = figures(shown(command_lines(Path(folder) / name, cache), quick))
-    found = {"help_s": help_seconds(), **figures(lines)}
-    if other is not None and not quick:
-        before = paired["against"]["whole_minutes"]
-        paired["ratio_cold"] = found["whole_minutes"] / before
-        paired["ratio_warm"] = paired["warm"]["whole_minutes"] / before
-    result = {**found, **paired} if quick else {**found, **paired, **results(out)}
     import tuned  # noqa: F401  (before jax starts: the run had all cores)
 
-    printed = [[round(line.seconds, 1), line.text] for line in lines]
-    write_json(arguments.out / f"{name}.json", {**result, "printed": printed, **origin(0)})
-    print(json.dumps({k: result[k] for k in result if k not in ("torque_distances", "sentence")}))
+    result = found | paired | ratios(found, paired)
+    write_json(written, result | origin(0))
+    print(json.dumps({k: result[k] for k in result if k not in ("torque_distances", "sentence", "printed")}))
+
+
+def ratios(found: dict[str, Any], paired: dict[str, Any]) -> dict[str, float]:
+    """Of the whole command's minutes to the other commit's, with an empty cache and with its own: those there are."""
+    if "against" not in paired or "effects" not in paired["against"]:  # a quick one
+        return {}
+    before = paired["against"]["whole_minutes"]
+    warm = {"ratio_warm": paired["warm"]["whole_minutes"] / before} if "warm" in paired else {}
+    return {"ratio_cold": found["whole_minutes"] / before, **warm}
 
 
 if __name__ == "__main__":
