@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from droid_jax.discrepancy.config import SelectionConfig
+from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
 from droid_jax.rehearsal.linear import Leftover, LinearModel, RehearsalConfig, leftover, unhindered
@@ -39,7 +39,7 @@ class Smallest:
 
 
 def smallest_sizes(
-    model: LinearModel, wanted: Sequence[int], config: RehearsalConfig, selection: SelectionConfig | None = None
+    model: LinearModel, wanted: Sequence[int], config: RehearsalConfig, search: DiscrepancyConfig | None = None
 ) -> list[Smallest]:
     """The smallest size of each wanted direction that the score test and the validation test find.
 
@@ -47,9 +47,9 @@ def smallest_sizes(
         model: the linear model.
         wanted: indices of directions.
         config: of the rehearsal.
-        selection: the search's thresholds.
+        search: the search's thresholds.
     """
-    selection = selection or SelectionConfig()
+    search = search or DiscrepancyConfig()
     units = model.repeats**0.5 if model.repeated else 1.0
     left = [leftover(model, k) for k in wanted]
     about = np.array([_about(of, units) for of in left])
@@ -61,10 +61,10 @@ def smallest_sizes(
             out.append(Smallest(np.inf, {}, "no signal", np.nan))
             continue
         often = max(float(scipy.stats.norm.ppf(config.share)), 0.0)
-        surely = float(scipy.stats.norm.ppf(0.5 * (1 + selection.interval_level)))
+        surely = float(scipy.stats.norm.ppf(0.5 * (1 + search.selection.interval_level)))
         drawn = {
-            "score test": of.size_of(scores.crossings(i, selection.significance) / units),
-            "validation": of.size_of(gain_crossings(model, i, rows[i][1], config, selection), validation=True),
+            "score test": of.size_of(scores.crossings(i, search.selection.significance) / units),
+            "validation": of.size_of(gain_crossings(model, i, rows[i][1], config, search), validation=True),
             "time step": discrepancy_crossings(model, k, of, config),
         }
         fixed = {
@@ -296,7 +296,7 @@ def _of_blocks(
 
 
 def gain_crossings(
-    model: LinearModel, number: int, added: np.ndarray, config: RehearsalConfig, selection: SelectionConfig
+    model: LinearModel, number: int, added: np.ndarray, config: RehearsalConfig, search: DiscrepancyConfig
 ) -> np.ndarray:
     """[R] how much an effect must add to the validation part for the gain to be no chance and to take its share of U.
 
@@ -307,9 +307,9 @@ def gain_crossings(
     if size < 1e-12:
         return np.full(config.draws, np.inf)
     if isinstance(rows, Repeats):
-        return _repeats_gain(model, rows, added / size, config, selection, rng)
+        return _repeats_gain(model, rows, added / size, config, search, rng)
     assert isinstance(rows, Blocks)
-    return _blocks_gain(model, rows, added / size, config, selection, rng)
+    return _blocks_gain(model, rows, added / size, config, search, rng)
 
 
 def _repeats_gain(
@@ -317,14 +317,14 @@ def _repeats_gain(
     rows: Repeats,
     unit: np.ndarray,
     config: RehearsalConfig,
-    selection: SelectionConfig,
+    search: DiscrepancyConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Gains a m.e + a^2 m.m / 2 of each repeat are above zero by Student's t of their detrended scatter."""
     count = model.repeats
     noise = scatter(rows, unit[None], config.pooling)[0] * rng.normal(size=(config.draws, count))
     straight = detrended(noise.T).T
-    least = scipy.stats.t(max(count - 2, 1)).isf(selection.confirmation)
+    least = scipy.stats.t(max(count - 2, 1)).isf(search.selection.confirmation)
     return np.maximum(2 * (least * straight.std(axis=1, ddof=1) / count**0.5 - straight.mean(axis=1)), 0.0)
 
 
@@ -333,11 +333,14 @@ def _blocks_gain(
     rows: Blocks,
     unit: np.ndarray,
     config: RehearsalConfig,
-    selection: SelectionConfig,
+    search: DiscrepancyConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """The same by sign flips of blocks; and U, which holds the noise, must fall by its share."""
-    count, share = rows.units, selection.least_gain
+    """The same by sign flips of blocks; and U, which holds the noise, must fall by its share.
+
+    An effect that is hidden alone leaves nothing to find, so the smaller of the search's two shares is asked for.
+    """
+    count, share = rows.units, search.blocks.least_gain
     squares = np.array([np.sum(unit[rows.block == b] ** 2) for b in range(count)])
     level = model.validation.level * rows.counted.sum()
     least = np.sqrt(share / (1 - share) * level)
@@ -349,6 +352,6 @@ def _blocks_gain(
     def passes(size: np.ndarray) -> np.ndarray:
         gains = 0.5 * size[:, None] ** 2 * squares + size[:, None] * noise
         t = t_values(gains, flips)
-        return np.mean(t >= t[0] - 1e-12, axis=0) < selection.confirmation
+        return np.mean(t >= t[0] - 1e-12, axis=0) < search.selection.confirmation
 
     return np.maximum(_crossings(passes, len(noise)), least)

@@ -67,7 +67,7 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
     model, space = found.model.of(found.compared), found.case.full_space
     wanted = one_shape_each(model.directions)
     out = []
-    for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config.selection), strict=True):
+    for k, size in zip(wanted, smallest_sizes(model, wanted, rehearsal, config), strict=True):
         direction, p = model.directions[k], space[model.directions[k].coefficient]
         others = alternatives_of(model, k, size.size, config, rehearsal.share)
         out.append(
@@ -227,7 +227,7 @@ def improvements(
         )
 
     def sizes(of: LinearModel, rows: Sequence[int]) -> np.ndarray:
-        return np.array([s.size for s in smallest_sizes(of, rows, rehearsal, config.selection)])
+        return np.array([s.size for s in smallest_sizes(of, rows, rehearsal, config)])
 
     for what, other, more in _variants(found):
         if not other.repeated and more > 1:
