@@ -11,9 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-import scipy.linalg
-from scipy import sparse
-from scipy.signal.windows import parzen
+import scipy
 
 from droid_jax.arguments import check_fields, number, shown, weights, whole
 
@@ -86,7 +84,7 @@ def coarse_clock(start: float, end: float, rate: float = DEFAULT_NOISE.rate) -> 
     return np.linspace(start, end, max(2, round((end - start) * rate) + 1))
 
 
-def lowpass(clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE) -> sparse.csr_array:
+def lowpass(clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE) -> scipy.sparse.csr_array:
     """[K, T] matrix from samples at a growing `clock` to smoothed values at `coarse`, sparse: a window is short.
 
     A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
@@ -104,17 +102,20 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT
     spacing[[0, -1]] *= 0.5  # trapezoidal rule: the same result at every sampling rate
     kernel = np.sinc(2 * config.cutoff * lag) * (0.5 + 0.5 * np.cos(np.pi * np.clip(lag / half, -1, 1)))
     shape = (len(coarse), len(clock))
-    weights = sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
+    weights = scipy.sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
     total = weights.sum(axis=1)
     enough = total > config.least_window / (2.0 * config.cutoff)  # of the whole window's area
     usual = np.median(np.diff(clock)) if len(clock) > 1 else np.inf
     if not enough.all() and usual > COARSEST / config.cutoff:
         raise ValueError(f"a clock with steps of {usual:.3g} s is too coarse to be smoothed at {config.cutoff} Hz")
-    return sparse.diags_array(np.where(enough, 1.0 / np.where(enough, total, 1.0), 0.0)) @ weights
+    return scipy.sparse.diags_array(np.where(enough, 1.0 / np.where(enough, total, 1.0), 0.0)) @ weights
 
 
 def smooth(
-    values: np.ndarray, mask: np.ndarray, kernel: sparse.csr_array, least_window: float = DEFAULT_NOISE.least_window
+    values: np.ndarray,
+    mask: np.ndarray,
+    kernel: scipy.sparse.csr_array,
+    least_window: float = DEFAULT_NOISE.least_window,
 ) -> np.ndarray:
     """[N, T, C] with mask, through a `lowpass` [K, T] -> [N, K, C], renormalised over the samples that were measured.
 
@@ -193,7 +194,7 @@ def _lags(error: np.ndarray, seen: np.ndarray, config: NoiseConfig) -> tuple[np.
     lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / freedom
     longest = round(config.longest_lag * config.rate)
     window = np.zeros(length)
-    window[: longest + 1] = parzen(2 * longest + 1)[longest : longest + length]
+    window[: longest + 1] = scipy.signal.windows.parzen(2 * longest + 1)[longest : longest + length]
     return lags * window, float(np.sum(lengths * constants**2) / freedom)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.windowed_log import WindowedLog

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time, detrend
 from droid_jax.discrepancy.config import BlocksConfig

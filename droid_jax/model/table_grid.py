@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator  # pyright: ignore[reportMissingTypeStubs]
+import scipy
 
 Function = Callable[[np.ndarray], np.ndarray]  # [K, axes] -> [K]
 FINE, COARSE = 1e-3, 5e-3  # of the function: error between nodes of variables, and of parameters
@@ -88,5 +88,5 @@ def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, point
     if not wide:
         return float(np.abs(function(x[:1]) - table.reshape(-1)[0]).max())
     narrow = tuple(i for i in range(len(axes)) if i not in wide)
-    inner = RegularGridInterpolator([axes[i].nodes for i in wide], np.squeeze(table, narrow))
+    inner = scipy.interpolate.RegularGridInterpolator([axes[i].nodes for i in wide], np.squeeze(table, narrow))
     return float(np.abs(inner(x[:, wide]) - function(x)).max())

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from scipy import signal
+import scipy
 
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
@@ -99,10 +99,10 @@ def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:
     if last <= first or count < FEWEST:
         return None
     time = first + np.arange(count) / rate
-    filtered = signal.butter(2, min(CUTOFF, rate / 5.0), fs=rate, output="sos")
+    filtered = scipy.signal.butter(2, min(CUTOFF, rate / 5.0), fs=rate, output="sos")
 
     def smooth(trace: np.ndarray) -> np.ndarray:
-        return signal.sosfiltfilt(filtered, trace)
+        return scipy.signal.sosfiltfilt(filtered, trace)
 
     measured = {
         name: {j: smooth(x) for j, x in _means(channel, time, scene.single_joints).items()}

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import interpolate, signal
+import scipy
 
 from droid_jax.recordings.recording import Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
@@ -99,8 +99,10 @@ def measured_motion(
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
-    q = signal.sosfiltfilt(signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
-    path = interpolate.make_interp_spline(even, q, k=5)  # differences lose 3 to 15 % of a fast motion in a slow log
+    q = scipy.signal.sosfiltfilt(scipy.signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
+    path = scipy.interpolate.make_interp_spline(
+        even, q, k=5
+    )  # differences lose 3 to 15 % of a fast motion in a slow log
     rows = (path(clock), path.derivative(1)(clock), path.derivative(2)(clock))
     config, timestep = rest or RestConfig(), (clock[-1] - clock[0]) / (len(clock) - 1)
     white = white_noise(position - q, rate, cutoff)
@@ -128,7 +130,7 @@ def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, longest: fl
             if time[last] - time[first] <= longest:
                 between = slice(first + 1, last)
                 near = seen[max(0, gap - 3) : gap + 5]
-                path = interpolate.make_interp_spline(time[near], values[n, near, j], k=min(3, len(near) - 1))
+                path = scipy.interpolate.make_interp_spline(time[near], values[n, near, j], k=min(3, len(near) - 1))
                 values[n, between, j] = path(time[between])
                 mask[n, between, j] = True
     return values, mask
@@ -180,7 +182,7 @@ def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -
             f"be smoothed at {cutoff:g} Hz; cut the log there or give --motion-cutoff (CompareConfig.motion_cutoff) "
             f"below {1 / (2.5 * steps[longest]):.3g} Hz"
         )
-    return interpolate.CubicSpline(time, position)(np.linspace(time[0], time[-1], len(time)))
+    return scipy.interpolate.CubicSpline(time, position)(np.linspace(time[0], time[-1], len(time)))
 
 
 def _inner_clock(name: str, time: np.ndarray, rate: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, signal
+import scipy
 
 from droid_jax.recordings.recording import Recording
 
@@ -73,8 +73,8 @@ def at_rest(
     lasts = math.ceil(config.stop / cutoff / timestep)
     around = 2 * math.ceil(config.settle / cutoff / timestep) + 1
     edge = lasts // 2 + 1  # a stop at an end of the log may go on outside of it
-    stopped = ndimage.binary_opening(np.pad(slow, ((edge, edge), (0, 0)), "edge"), np.ones((lasts, 1)))
-    return slow | ndimage.binary_dilation(stopped, np.ones((around, 1)))[edge:-edge]
+    stopped = scipy.ndimage.binary_opening(np.pad(slow, ((edge, edge), (0, 0)), "edge"), np.ones((lasts, 1)))
+    return slow | scipy.ndimage.binary_dilation(stopped, np.ones((around, 1)))[edge:-edge]
 
 
 def white_noise(high: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
@@ -115,7 +115,7 @@ def torque_at(
         return torque, noise
     channel = recording.channels["torque"]
     rate = (len(channel.time) - 1) / float(channel.time[-1] - channel.time[0])
-    sections = signal.butter(4, cutoff, fs=rate, output="sos") if rate > 2.5 * cutoff else None
+    sections = scipy.signal.butter(4, cutoff, fs=rate, output="sos") if rate > 2.5 * cutoff else None
     for j, joint in enumerate(joints):
         if joint not in channel.columns:
             continue
@@ -127,7 +127,7 @@ def torque_at(
         mean = np.sum(np.where(mask, values, 0.0), axis=0)[seen] / mask.sum(axis=0)[seen]
         series = np.interp(channel.time, channel.time[seen], mean)
         if sections is not None and len(series) > SHORTEST:
-            smoothed = signal.sosfiltfilt(sections, series)
+            smoothed = scipy.signal.sosfiltfilt(sections, series)
             white = white_noise(series - smoothed, rate, cutoff)
             noise[j], series = derivative_noise(white, 0, rate, cutoff), smoothed
         torque[:, j] = np.interp(clock, channel.time, series)

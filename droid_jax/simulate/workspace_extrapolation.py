@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
@@ -46,7 +46,7 @@ def opened_further(scene: Scene, recording: Recording, replayed: Rollout) -> Rec
     longer = time_scaled(recording, stretched)
     since = longer.time - longer.time[0] - at
     share = minimum_jerk(np.minimum(since, 2 * seconds - since) / seconds)
-    step = CubicSpline(np.linspace(0.0, 1.0, KNOTS), path - path[0])(share)  # [T, J]
+    step = scipy.interpolate.CubicSpline(np.linspace(0.0, 1.0, KNOTS), path - path[0])(share)  # [T, J]
     command = longer.command.copy()
     columns = [recording.command_names.index(j) for j in scene.joints]
     command[:, columns] += step
