@@ -16,6 +16,7 @@ from droid_jax.cost.noise import NoiseConfig
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.search import CmaConfig
+from droid_jax.simulate.windows import WindowConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 WRITTEN = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "experiments/README.md", "benchmarks/README.md")
@@ -154,7 +155,9 @@ def test_every_threshold_is_documented(config: type):
 
 
 @pytest.mark.parametrize(
-    "config", [NoiseConfig, DiscrepancyConfig, RefineConfig, CmaConfig], ids=lambda config: config.__name__
+    "config",
+    [NoiseConfig, DiscrepancyConfig, RefineConfig, CmaConfig, WindowConfig],
+    ids=lambda config: config.__name__,
 )
 def test_documented_settings_are_the_defaults(config: type):
     rows = {name: value for (of, name), value in documented().items() if of == config.__name__}

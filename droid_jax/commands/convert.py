@@ -57,8 +57,8 @@ class Convert:
     gravity: bool = False
     """The torque contains what carries the arm's weight."""
     torque_constant: tuple[float, ...] = ()
-    """N m (N) that one unit of the logged torque is, for each torque or one for all: of efforts that are amperes or
-    per cent. A negative one turns the sign. (Of columns with a unit it belongs into the map.)"""
+    """N m (N) at the joint that one unit of the logged torque is, for each torque or one for all: of efforts that are
+    amperes or per cent; with --units torque=mA that one A is. A negative one turns the sign."""
     state_topic: str = "/joint_states"
     """Bags: topic of JointState, or of the state of a controller, of a Franka arm or of unitree's motors."""
     command_topic: str | None = None
@@ -126,7 +126,7 @@ def run(command: Convert) -> None:
             usual = {"name": command.name, "allow_jitter": command.allow_jitter}
             options = usual if strange else _bag_options(command)
             recording = load_recording(path, resample=command.resample, **options)
-    if command.torque_constant:
+    if command.torque_constant and not _of_currents(command):  # those are in the map
         recording = with_torque_constants(recording, command.torque_constant)
     if command.start is not None or command.end is not None:
         first, last = recording.span
@@ -152,7 +152,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         command.map,
         episodes=command.episodes,
         channels=_pairs(command.columns, "--columns CHANNEL=COLUMN, e.g. position=q{n}"),
-        units=_pairs(command.units, "--units KIND=UNIT, e.g. angle=deg"),
+        units=_units(command),
         beside=command.out.parent,
         name=command.name or command.out.stem,
         command_tolerance=command.command_tolerance,
@@ -165,6 +165,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         stiffness=command.stiffness,
         damping=command.damping,
         rate=command.rate,
+        torque_constant=command.torque_constant if _of_currents(command) else (),
     )
     print(f"columns as in {origin}")
 
@@ -173,6 +174,17 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         print(f"the next log of this kind needs no options while {beside} is there")
 
     return recording, keep
+
+
+def _units(command: Convert) -> dict[str, str]:
+    return _pairs(command.units, "--units KIND=UNIT, e.g. angle=deg")
+
+
+def _of_currents(command: Convert) -> bool:
+    """Whether --units says that the torques are currents."""
+    from droid_jax.recordings.units import CURRENTS
+
+    return _units(command).get("torque") in CURRENTS
 
 
 def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:

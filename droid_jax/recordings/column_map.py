@@ -166,7 +166,11 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
 
 
 def changed_map(
-    columns: ColumnMap | None, channels: Mapping[str, str], units: Mapping[str, str], **changes: Any
+    columns: ColumnMap | None,
+    channels: Mapping[str, str],
+    units: Mapping[str, str],
+    torque_constant: Sequence[float] = (),
+    **changes: Any,
 ) -> ColumnMap:
     """A map with what the command line says in place of its own; None: of nothing but that.
 
@@ -174,6 +178,7 @@ def changed_map(
         columns: the map that is changed.
         channels: channel or "time" -> columns, several with commas between them.
         units: "angle", "length", "torque", "force", "time" -> unit.
+        torque_constant: of the torque's columns, one for each joint or one for all.
         changes: other fields of `ColumnMap`; None and empty ones change nothing.
     """
     where = "--columns"
@@ -188,6 +193,12 @@ def changed_map(
     if strange := [name for name in units if name not in Units.__struct_fields__]:
         raise ValueError(f"--units: {strange[0]!r} has no unit; known are: {', '.join(Units.__struct_fields__)}")
     content["units"] = {**content.get("units", {}), **units}
+    if torque_constant:
+        if "torque" not in content:
+            raise ValueError("--torque-constant: no column of the torque is named (--columns torque=...)")
+        entry = content["torque"]
+        of_one = torque_constant[0] if len(torque_constant) == 1 else list(torque_constant)
+        content["torque"] = {**(entry if isinstance(entry, dict) else {"columns": entry}), "torque_constant": of_one}
     content |= {name: list(v) if isinstance(v, tuple) else v for name, v in changes.items() if v not in (None, ())}
     return check_map(typed(content, ColumnMap, where), where)
 

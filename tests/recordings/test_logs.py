@@ -456,6 +456,22 @@ def test_maps_come_back_as_they_were_written(tmp_path: Path):
     assert all(read_map(name) for name in layouts())
 
 
+def test_currents_need_no_map_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path, out = log(tmp_path / "a.csv", tau1=1000 * POSITION[:, 0], tau2=500 * POSITION[:, 0]), tmp_path / "out"
+    said = ["--columns", "time=t", "command=cmd{n}", "position=q9,q10", "torque=tau1,tau2", "--joints", *JOINTS]
+    said += ["--units", "angle=rad", "torque=mA", "--torque", "motor", "--gravity"]
+    assert main(["convert", str(path), *said, "--out", str(out / "none.npz")]) == 2
+    assert "torque_constant is needed for the unit 'mA'" in capsys.readouterr().err
+    assert main(["convert", str(path), *said, "--torque-constant", "1.8", "-1.2", "--out", str(out / "one.npz")]) == 0
+    assert main(["convert", str(path), "--out", str(out / "two.npz")]) == 0  # by the map that the first one left
+    for name in ("one", "two"):
+        torque = load_recording(out / f"{name}.npz").channels["torque"].values[0]
+        np.testing.assert_allclose(torque, POSITION[:, :1] * [1.8, -0.6], rtol=1e-6)
+    wrong = [word for word in said if not word.startswith("torque=tau")]
+    assert main(["convert", str(path), *wrong, "--torque-constant", "2", "--out", str(tmp_path / "no" / "x.npz")]) == 2
+    assert "--torque-constant: no column of the torque" in capsys.readouterr().err
+
+
 def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     first, second = log(tmp_path / "a.csv"), log(tmp_path / "b.csv", q9=POSITION[:, 0] + 0.1)
     said = ["--columns", "time=t", "command=cmd{n}", "position=q9,q10", "--units", "angle=rad", "--joints", *JOINTS]
