@@ -22,7 +22,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.batching import block_size
 from droid_jax.simulate.compiled import window_program
-from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.replay import Drive, end_on
 from droid_jax.simulate.servo_gains import servo_factors
 from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
@@ -198,9 +198,11 @@ def in_windows(
     windows: WindowConfig,
     effects: Sequence[Effect],
     grid: float | None,
-) -> Piece:
-    """A repeat in windows, without those in which something was not measured; see `windowed_log`."""
+) -> Piece | None:
+    """A repeat in windows, without those in which something was not measured; see `windowed_log`.  None: in all."""
     made = cut(scene, recording, drive, repeat, windows, grid)
+    if not len(made.begin):
+        return None
     instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate
     clocks, at = made.begin[:, None] + np.arange(made.steps) * drive.timestep, made.begin[:, None] + windows.lead
     at = at + instants
@@ -223,14 +225,17 @@ def as_a_whole(
     windows: WindowConfig,
     effects: Sequence[Effect],
     steps: int,
+    grid: float | None,
 ) -> Piece:
     """A repeat from its beginning, without instants that were not measured.
 
-    steps: as long as it is replayed.  windows: `lead` of the beginning is not compared; `reach` tells how far the start
-    may be off, but not where an object is gripped, whose contacts change with it.
+    steps: as long as it is replayed.  grid: s, the time step whose last instant is the last one compared; None: its
+    own.  windows: `lead` of the beginning is not compared; `reach` tells how far the start may be off, but not where an
+    object is gripped, whose contacts change with it.
     """
     begin = float(recording.time[0])
-    last = min(begin + float(drive.time[-1]), *(float(recording.channel(n).time[-1]) for n in config.channels))
+    end = end_on(recording, grid or drive.timestep)
+    last = min(begin + end, *(float(recording.channel(n).time[-1]) for n in config.channels))
     clocks, at = (
         begin + np.arange(steps)[None] * drive.timestep,
         coarse_clock(begin + windows.lead, last, config.noise.rate)[None],

@@ -217,9 +217,10 @@ def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> 
     Recordings of the same columns share half of its size: it is the geometric mean of what this one leaves and of what
     all leave, as root mean squares.  Each with its own, one that the model follows badly would count for little, and
     one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or 0.095 rad as their search fell out,
-    and so at 0.051 to 0.054.  With all of it shared, the log that is followed worst would decide.
+    and so at 0.051 to 0.054.  With all of it shared, the log that is followed worst would decide.  One whose simulation
+    blew up keeps the noise that it had.
     """
-    single = [k for k, c in enumerate(comparisons) if c.repeats == 1]
+    single = [k for k, c in enumerate(comparisons) if c.repeats == 1 and np.all(rollouts[k].finite)]
     left = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
     alike = defaultdict[tuple[Any, ...], list[np.ndarray]](list)
     for k in single:

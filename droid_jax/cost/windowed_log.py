@@ -259,12 +259,12 @@ def windowed_log(
         assert isinstance(drive, Drive)
         drives.append(drive)
     lasting = shared_steps([len(drive.command) for drive in drives])
-    pieces = list[Piece]()
+    made = list[Piece | None]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):
             of = scene, space, recording, repeat, drive, config, windows, effects
-            pieces.append(as_a_whole(*of, steps) if why else in_windows(*of, grid))
-    pieces = [piece for piece in pieces if piece.count]
+            made.append(as_a_whole(*of, steps, grid) if why else in_windows(*of, grid))
+    pieces = [piece for piece in made if piece is not None and piece.at.size]
     if not pieces:
         raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")
     order, unit, fitted = _order(pieces, fitted_share)

@@ -41,7 +41,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
-from droid_jax.simulate.windows import held
+from droid_jax.simulate.windows import held, why_whole
 
 Log: TypeAlias = LoneLog | WindowedLog
 Report: TypeAlias = Callable[[RefineProgress], None] | None
@@ -328,7 +328,6 @@ def windowed_case(
     config = config or DiscrepancyConfig()
     config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
     base = restrained(base, config.selection.nuisance_bound)
-    scene, whole = ready(scene), joined(base, effects)
     share = 1.0 if test else config.blocks.fitted_share
     at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
     compare, windows, judging = config.compare, config.windows, config.windows
@@ -338,6 +337,11 @@ def windowed_case(
         config = replace(
             config, **{name: replace(getattr(config, name), **FEWER_TRIALS) for name in ("refine", "refit", "polish")}
         )
+    unknown = list[Effect]()
+    if not at_once and not any(why_whole(scene, recording) for recording in train):
+        unknown = [e for e in effects if e.over_time]
+        effects = [e for e in effects if not e.over_time]
+    scene, whole = ready(scene), joined(base, effects)
     log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
     own = per_recording_nuisances(base) if test else []
@@ -364,6 +368,11 @@ def windowed_case(
         sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
     last = sets[2] if len(sets) > PARTS else None
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
+    if unknown:
+        limits.append(
+            f"Windows do not know when their recording began, so {' and '.join(e.name for e in unknown)} cannot be "
+            "looked for in them (--replay whole looks for all)."
+        )
     if sampled and not log.whole:
         limits.insert(
             0,

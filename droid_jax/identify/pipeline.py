@@ -255,6 +255,7 @@ def prepare(
     if config.engine == "auto":
         engine = choose_engine(scene, full, [*recordings, *judges], effects, config.search.population)
     base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
+    _check_start(base, full)
     if len(chosen) > 1:
         config = replace(config, compare=replace(config.compare, channels=in_noise_units(base, full.mean)))
         base = base.against(fitted, config.compare)
@@ -268,7 +269,6 @@ def prepare(
         if commanded and not judges
         else make_cost(scene, full, held, engine=engine.engine, config=plain, effects=effects, check=False)
     )
-    _check_start(base, full)
     begun = [beginning(recording, config.beginning) for recording in fitted]
     early = base
     if any(short is not recording for short, recording in zip(begun, fitted, strict=True)):

@@ -97,6 +97,7 @@ class Effect:
     minimum_size:     amplitude below which it is not named, in its own unit.
     natural_bounds:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may
     stand there.
+    over_time: its law goes by the time since the recording began, of which a window out of it knows nothing.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Effect:
     shape_parameters: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     minimum_size: float = 0.0
     natural_bounds: tuple[str, ...] = ()
+    over_time: bool = False
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -83,12 +83,14 @@ def read_logs(
         command_names=command_names,
         channels=channels,
         torque=TorqueConvention(side, True if columns.gravity is None else columns.gravity),
-        qpos0=start_positions(channels),
         gains=ServoGains(np.array(columns.stiffness), np.array(columns.damping)) if columns.stiffness else None,
         phases=tuple(phases),
         meta=_meta(places, _first(logs[0], columns), columns),
     )
-    return accept(recording, ", ".join(places), allow_jitter)
+    # A state log may begin long before the first command, from which the replay starts.
+    begun = recording.measured_start()
+    qpos0 = {joint: begun.get(joint, first) for joint, first in start_positions(channels).items()}
+    return accept(replace(recording, qpos0=qpos0), ", ".join(places), allow_jitter)
 
 
 def fits(opened: Opened, columns: ColumnMap) -> bool:
@@ -201,7 +203,9 @@ def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: in
             raise ValueError(f"{log.where}, time: column {shown(name)} has {numbers.shape[1]} numbers in a row")
         if (bad := np.flatnonzero(~np.isfinite(numbers))).size:
             raise ValueError(f"{log.where}, time, row {bad[0]}: expected a number, got {numbers[bad[0]]}")
-        # Whole numbers are subtracted as such: nanoseconds since 1970 do not fit a float64.
+        # Whole numbers are subtracted as such: nanoseconds since 1970 do not fit a float64.  Unsigned ones wrap.
+        if numbers.dtype.kind == "u":
+            numbers = numbers.astype(np.int64)
         parts.append((numbers, TIMES[unit or _usual_unit(numbers, f"{log.where}, time {shown(name)}")]))
     time = np.sum([(n - n[0]) * scale for n, scale in parts], axis=0)
     regular = allow_jitter or rate is not None
@@ -238,7 +242,8 @@ def _on_one_clock(repeats: list[dict[str, _Series]], rate: float, places: Sequen
         for key, one in repeat.items():
             values = interpolate(clock, one.time, one.values)
             if key != "command":
-                values = np.where(in_gap(clock, one.time)[:, None], np.nan, values)
+                outside = (clock < one.time[0] - SLACK) | (clock > one.time[-1] + SLACK)
+                values = np.where((outside | in_gap(clock, one.time))[:, None], np.nan, values)
             series[key] = _Series(clock, values)
         out.append(series)
     return out

@@ -80,6 +80,13 @@ def _units(schema: pl.Schema) -> dict[str, str]:
     return {name: "ns" for name, kind in schema.items() if kind.is_temporal()}
 
 
+def _nanoseconds(column: pl.Series) -> pl.Series:
+    """Of a column of dates, times or durations, which polars stores in days, milliseconds or finer."""
+    if isinstance(column.dtype, pl.Duration):
+        return column.dt.total_nanoseconds()
+    return column.dt.epoch("ns") if isinstance(column.dtype, pl.Datetime | pl.Date) else column.cast(pl.Int64)
+
+
 def _separator(path: Path) -> str:
     """The one of SEPARATORS that stands most often in the header."""
     with path.open("rb") as file:
@@ -132,7 +139,7 @@ def _array(column: pl.Series, where: str) -> np.ndarray:
     if isinstance(column.dtype, pl.List | pl.Array):
         return _vectors(column.cast(pl.List(pl.Float64)), where)
     if column.dtype.is_temporal():
-        column = column.dt.epoch("ns") if isinstance(column.dtype, pl.Datetime) else column.cast(pl.Int64)
+        column = _nanoseconds(column)
     if column.dtype == pl.Null or column.null_count():
         column = column.cast(pl.Float64).fill_null(np.nan)
     return column.to_numpy()

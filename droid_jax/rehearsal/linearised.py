@@ -19,7 +19,7 @@ from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, with_finer_step, with_step_difference
+from droid_jax.discrepancy.fitting import FittedModel, until, with_finer_step, with_step_difference
 from droid_jax.discrepancy.log_case import base_model, case_of, least_residual, refitted_residual
 from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import RefineConfig, Refined
@@ -213,7 +213,8 @@ def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recor
         config, timestep = residual_set.comparison.config, float(known.scene.model.opt.timestep)
         scenes = [with_options(known.scene, timestep=timestep / parts) for parts in FINE]
         with contextlib.suppress(ValueError):  # of what plain C does not have
-            costs = [make_cost(s, base, [recording], engine="mujoco", config=config, check=False) for s in scenes]
+            compared = until(recording, known.drives[0])
+            costs = [make_cost(s, base, [compared], engine="mujoco", config=config, check=False) for s in scenes]
     if not costs:
         return difference(with_finer_step(residual_set, base, recording))
     near, nearer = map(difference, costs)

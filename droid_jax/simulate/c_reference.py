@@ -92,6 +92,8 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
     functions = ("command", "servo", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
+    if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
+        return f"C does not have {', '.join(p.name for p in sensed)}"
     weight = scene.model.body_gravcomp.any() and weight_share(scene.model, scene.joint_dofs, torque.gravity).any()
     if torque.side is TorqueSide.LINK or weight:
         return "its torque is the actuators': motor-side, and without gravity where the scene compensates it"

@@ -17,7 +17,7 @@ import jax
 
 from droid_jax import distributed, runtime
 from droid_jax.model.effect_interface import Effect
-from droid_jax.model.parameters import Role, Space
+from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_not_in_c
@@ -62,8 +62,6 @@ def choose_engine(
         return EngineChoice("mjx", "repeats resolve the error of C's steps of first order")
     if scene.grip is not None or scene.model.npair:
         return EngineChoice("mjx", "contact pairs need its second-order step")
-    if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
-        return EngineChoice("mjx", f"C does not have {', '.join(p.name for p in sensed)}")
     reasons = [why_not_in_c(scene, space, r.torque, effects) for r in recordings]
     if reason := next(filter(None, reasons), None):
         return EngineChoice("mjx", reason)

@@ -72,6 +72,11 @@ class Drive:
         return np.arange(len(self.command)) * self.timestep
 
 
+def end_on(recording: Recording, timestep: float) -> float:
+    """s after the recording's beginning, the last time step that its commands reach."""
+    return timestep * float(np.floor((recording.time[-1] - recording.time[0]) / timestep + 1e-6))
+
+
 def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config: StartConfig = DEFAULT_START) -> Drive:
     """Resample a recording's command onto the simulation's clock and order its columns.
 
@@ -88,9 +93,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     columns = scene.command_index(recording.command_names)
     check_joints(recording, scene.needs_command, also=(*scene.command_names, *scene.single_joints))
     timestep = float(scene.model.opt.timestep)
-    start, end = float(recording.time[0]), float(recording.time[-1])
-    steps = int(np.floor((end - start) / timestep + 1e-6)) + 1
-    clock = start + np.arange(steps) * timestep
+    steps = round(end_on(recording, timestep) / timestep) + 1
+    clock = float(recording.time[0]) + np.arange(steps) * timestep
     qpos0 = start_pose(scene, recording, config)
     held = holding(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)

@@ -174,7 +174,7 @@ def _spread(last: int, least: int, every: float) -> np.ndarray:
 
     Within their stretches by the golden ratio, so that a motion that repeats is not seen at one phase alone.
     """
-    count = max(1, round(last / every))
+    count = max(1, min(round(last / every), last // least))
     begin = np.arange(count) * last / count
     within = (0.5 * (np.sqrt(5.0) - 1.0) * (1 + np.arange(count))) % 1.0
     return np.floor(begin + within * max(0.0, last / count - least)).astype(int)

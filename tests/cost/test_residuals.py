@@ -391,6 +391,19 @@ def test_recordings_of_the_same_columns_share_a_restated_noise(scene: Scene):
     assert untouched is repeated
 
 
+def test_a_log_whose_simulation_blew_up_takes_nothing_from_the_others(scene: Scene):
+    """The others are stated as without it, and it keeps what it had: a stiffer servo's log, at another log's best."""
+    logs = [compare(scene, recording(channel("torque", CLOCK, rollout().torque[None]))) for _ in range(3)]
+    wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
+    tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5)]
+    blown = rollout(torque=np.full_like(rollout().torque, np.nan), finite=np.array(False))
+    *both, kept = restated(logs, [*tried, blown])
+    alone = restated(logs[:2], tried)
+    for one, other in zip(both, alone, strict=True):
+        np.testing.assert_array_equal(one.channel("torque").noise.whitener, other.channel("torque").noise.whitener)
+    assert kept is logs[2]
+
+
 def test_repeats_deviate_as_they_are_whitened(scene: Scene):
     """A model that is one repeat leaves what the model that is the mean leaves, and that repeat's deviation."""
     clean = smooth_traces(3, 2)

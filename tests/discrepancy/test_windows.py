@@ -107,6 +107,8 @@ def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases()
     np.testing.assert_array_equal(places // 600, np.arange(20))
     assert np.diff(places).min() >= least and len(np.unique(places % 600)) == 20
     np.testing.assert_array_equal(_spread(90, 40, 200.0), [30])
+    crowded = _spread(2300, 1500, 1500.0)  # 2300 / 1500 rounds up
+    assert len(crowded) == 1 or np.diff(crowded).min() >= 1500
 
 
 def test_windows_that_are_left_out_are_not_compared(space: Space):
@@ -251,6 +253,51 @@ def test_a_masked_stretch_leaves_its_windows_out(space: Space):
     log, full = log_of(space, [with_a_gap()]), log_of(space, [swung("a", 1.0, 0.7, noise=NOISE)])
     assert full.unit.max() + 1 == 4 and log.unit.max() + 1 == 2
     assert set(np.round(log.pieces[0].at.ravel(), 6)) < set(np.round(full.pieces[0].at.ravel(), 6))
+
+
+def half_measured() -> Recording:
+    """Of two repeats, the second of which measured next to nothing."""
+    both = swung("a", 1.0, 0.7, noise=NOISE, repeats=2)
+    channel = both.channel("position")
+    mask = channel.mask.copy()
+    mask[1, 3:] = False
+    return replace(both, channels={"position": replace(channel, mask=mask)})
+
+
+def test_a_repeat_that_was_not_measured_is_left_out(space: Space):
+    log, full = log_of(space, [half_measured()]), log_of(space, [swung("a", 1.0, 0.7, noise=NOISE)])
+    assert [piece.count for piece in log.pieces] == [piece.count for piece in full.pieces]
+
+
+def test_a_finer_time_step_is_compared_at_the_same_instants(space: Space):
+    """Of motions that end between two steps, some of them just behind an instant that a finer step still reaches."""
+    first = swung("a", 1.0, 0.7, noise=NOISE)
+    for end in np.linspace(1.501, 1.603, 35):
+        commanded = first.time < end - 1e-6
+        time = np.r_[first.time[commanded], end]
+        cut = replace(first, time=time, command=np.r_[first.command[commanded], first.command[commanded][-1:]])
+        log = whole_log(space, [cut])
+        finer = log.finer(with_options(scene(), timestep=float(scene().model.opt.timestep) / 4), space)
+        np.testing.assert_allclose(finer.pieces[0].at, log.pieces[0].at)
+
+
+def test_what_goes_by_the_time_since_the_beginning_is_not_looked_for_in_windows(space: Space):
+    """As a clock's rate does; in whole motions it is."""
+    effects = library(scene(), ["clock_rate", "joint_coulomb"])
+    assert {e.name for e in effects if e.over_time} == {"clock_rate"}
+    asked = list[set[str]]()
+
+    def catch(of: Scene, over: Space, recordings: Any, compare: Any, windows: Any, effects: Any, *_: Any, **__: Any):
+        asked.append({e.name for e in effects})
+        raise Caught
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_case, "windowed_log", catch)
+        for replay in ("windows", "whole"):
+            config = DiscrepancyConfig(channels=("position",), replay=replay)
+            with pytest.raises(Caught):
+                log_case.windowed_case(scene(), space, effects, [swung("a", 1.0, 0.7)], [], config)
+    assert asked == [{"joint_coulomb"}, {"clock_rate", "joint_coulomb"}]
 
 
 def test_the_noise_of_a_window_holds_the_spread_of_its_state():

@@ -10,7 +10,9 @@ import re
 import sys
 import zipfile
 from pathlib import Path
+from typing import Literal
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -236,6 +238,45 @@ def test_seconds_and_nanoseconds_add_up(tmp_path: Path):
         load_recording(path, columns=columns)  # nanoseconds that were not said to be such
     columns = whole(time=TimeMap(["sec", "nsec"], ["s", "ns"]))
     check(load_recording(path, columns=columns), position=POSITION, velocity=VELOCITY, torque=TORQUE)
+
+
+def test_unsigned_nanoseconds_do_not_wrap(tmp_path: Path):
+    """As ROS 2 counts them."""
+    time = TIME + 0.93
+    seconds, part = np.divmod(np.round(time * 1e9).astype(np.int64), 10**9)
+    np.savez(tmp_path / "a.npz", sec=seconds.astype(np.int32), nsec=part.astype(np.uint32), cmd=COMMAND, q=POSITION)
+    columns = ColumnMap(
+        joints=list(JOINTS), time=TimeMap(["sec", "nsec"], ["s", "ns"]), command="cmd", position="q", units=RAD
+    )
+    check(load_recording(tmp_path / "a.npz", columns=columns), position=POSITION)
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+def test_durations_count_in_their_own_unit(tmp_path: Path, unit: Literal["ms", "us", "ns"]):
+    import polars as pl
+
+    stamps = pl.Series("t", np.round(TIME * 1e9).astype(np.int64)).cast(pl.Duration("ns")).cast(pl.Duration(unit))
+    frame = pl.DataFrame({"cmd": COMMAND.tolist(), "q": POSITION.tolist()}).with_columns(stamps)
+    frame.write_parquet(tmp_path / "a.parquet")
+    columns = ColumnMap(joints=list(JOINTS), time="t", command="cmd", position="q[0:2]", units=Units(angle="rad"))
+    check(load_recording(tmp_path / "a.parquet", columns=columns), position=POSITION)
+
+
+def test_a_motion_begins_where_its_first_command_finds_the_robot(tmp_path: Path):
+    """Not where the state log began, a second before, and what another file measured in part is masked elsewhere."""
+    before = np.arange(-1.0, TIME[-1], 0.01)
+    state = np.stack([np.interp(before, TIME, POSITION[:, j], left=9.0) for j in range(2)], axis=1)
+    state[before < -0.5] = 2.0
+    half = TIME <= 1.0
+    np.savez(tmp_path / "a.npz", t=TIME, cmd=COMMAND, ts=before, q=state, th=TIME[half], tau=TORQUE[half])
+    columns = ColumnMap(
+        joints=list(JOINTS), time="t", command="cmd", position=ChannelMap("q", time="ts"),
+        torque=ChannelMap("tau", time="th"), side="motor", gravity=True, units=RAD,
+    )  # fmt: skip
+    found = load_recording(tmp_path / "a.npz", columns=columns)
+    assert found.qpos0 == pytest.approx(dict(zip(JOINTS, POSITION[0], strict=True)), abs=1e-6)
+    one = load_recording(tmp_path / "a.npz", columns=msgspec.structs.replace(columns, rate=50.0)).channels["torque"]
+    np.testing.assert_array_equal(one.mask[0].all(axis=1), one.time <= 1.0 + 1e-6)
 
 
 def test_what_a_table_lacks_is_said_in_a_sentence(tmp_path: Path):

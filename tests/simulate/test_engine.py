@@ -12,6 +12,7 @@ from two_link import JOINTS, arm, recording
 from droid_jax import distributed, runtime
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.excitation import engine_for
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
@@ -43,6 +44,8 @@ def test_what_c_lacks_is_replayed_in_mjx(given: Recording, why: str):
 def test_parameters_and_effects_of_sensors_are_replayed_in_mjx():
     assert choose_engine(arm(), SPACE + joint_friction_space(JOINTS), [ONE]).engine == "mjx"
     assert choose_engine(arm(), SPACE, [ONE], [joint_friction_effect(JOINTS)]).engine == "mjx"
+    assert engine_for(arm(), SPACE + joint_friction_space(JOINTS), [ONE]) == "mjx"
+    assert engine_for(arm(), SPACE, [ONE]) == "mujoco"
 
 
 def test_other_machines_are_mjx(monkeypatch: pytest.MonkeyPatch):

@@ -73,6 +73,7 @@ def clock_rate(scene: Scene) -> Effect | None:
         confused_with=(COMMAND,),
         locations={"commands": (RATE,)},
         minimum_size=1e-4,
+        over_time=True,
     )
 
 

@@ -65,6 +65,7 @@ def torque_drift(scene: Scene) -> Effect | None:
         confused_with=("torque_bias", "cable_pull"),
         locations=a.places(scene.joints, DRIFT),
         minimum_size=0.005,
+        over_time=True,
     )
 
 
