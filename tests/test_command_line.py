@@ -23,7 +23,7 @@ from small_log import elbow_log, write_elbow
 from droid_jax import run
 from droid_jax.commands import convert, folder, options
 from droid_jax.commands.all_stages import All
-from droid_jax.commands.folder import OtherRun, changed, finished, setup_of
+from droid_jax.commands.folder import OtherRun, begin, changed, finished, setup_of
 from droid_jax.commands.gap import GapCommand
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.options import load_effects
@@ -685,3 +685,14 @@ def test_it_completes_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 @pytest.mark.parametrize("command", [["record", "--seed"], ["train", "--seed"], ["evaluate", "--robot"]])
 def test_a_negative_seed_is_refused(refused, command: list[str]):
     assert f"{command[1]} must not be negative, got -1" in refused(*command, "-1")
+
+
+@pytest.mark.parametrize(("before", "kept"), [("gap", ()), ("identify", ("gap.json", "gaussian.json"))])
+def test_starting_over_forgets_another_commands_results(tmp_path: Path, before: str, kept: tuple[str, ...]):
+    """Of the same command its own are forgotten alone, in a folder of several; what judged the fit goes with it."""
+    for name in ("gap.json", "gaussian.json", "config.json", "evaluation.json", "notes.txt"):
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "setup.json").write_text(json.dumps({"command": before}))
+    begin(tmp_path, {"command": "identify"}, again=True, stage="identify")
+    left = {p.name for p in tmp_path.iterdir()} - {"setup.json", "notes.txt"}
+    assert left == set(kept) - {"gaussian.json"} and (tmp_path / "notes.txt").exists()

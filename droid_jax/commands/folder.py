@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -10,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from droid_jax.files import CONFIG, LAST_FILES, RESULTS, SETUP
+from droid_jax.files import CONFIG, EVALUATION, EVALUATION_TRACES, LAST_FILES, RESULTS, SETUP
 from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import Setup, to_be_amended
 from droid_jax.storage import file_sha256
@@ -143,9 +144,19 @@ def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool 
     from droid_jax.storage import write_json
 
     if not keep:
-        forget(out, stage, results_alone=not again)
+        for each in LAST_FILES if again and _of_another_stage(out, stage) else (stage,):
+            forget(out, each, results_alone=not again)
+        for name in (EVALUATION, EVALUATION_TRACES):  # of the fit that goes
+            (out / name).unlink(missing_ok=True)
     write_json(out / SETUP, {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
+
+
+def _of_another_stage(out: Path, stage: str) -> bool:
+    """Whether another command's run is in a folder, or one of which nobody knows."""
+    with contextlib.suppress(OSError, ValueError):
+        return typed(read_json(out / SETUP), Setup, SETUP).get("command") != stage
+    return any((out / LAST_FILES[other]).exists() for other in LAST_FILES if other != stage)
 
 
 def forget(out: Path, stage: str, results_alone: bool = False) -> None:

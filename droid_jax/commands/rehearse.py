@@ -116,6 +116,8 @@ def run(command: Rehearse) -> None:
     config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
     found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
     setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}
+    if plan.values:  # out of a fit, which may be made again in its folder
+        setup["values"] = dict(plan.values)
     if command.full:
         result |= _full(command, scene, base, effects, recordings, plan, config, rehearsal, found, result, setup)
     result |= {"scene": scene.name, "setup": setup, "versions": runtime.versions(), "device": runtime.device()}

@@ -36,6 +36,8 @@ TRIES, SWEEPS = 2000, 40  # rows drawn until one is within the bounds; after tha
 FIRST_TRIES = 20  # of these, which mostly suffice
 ALIKE = 1e-9  # relative: what mj_setConst works out anew of the same numbers differs by rounding
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
+_AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_NAMED = ("table", "inertias")  # parts whose entries name an element
 _UNIT = ("body_quat", "jnt_axis", "geom_quat")
 _DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
              "jnt_axis", "geom_pos", "geom_quat"}  # fmt: skip
@@ -43,6 +45,7 @@ _WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
 _PLACE = {"body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size"}
 _OF_ELEMENTS = ("body_", "jnt_", "dof_", "qpos", "geom_", "site_", "pair_", "actuator_", "tendon_", "eq_", "cam_",
                 "light_")  # fmt: skip
+_SHAPED = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 _SURE = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
          "actuator_gainprm", "actuator_biasprm")  # fmt: skip
 
@@ -106,7 +109,8 @@ def batch(
     if prefix:
         if nameless := sorted({f"{row['element']} {row['id']}" for row in fit["table"] if not row["name"]}):
             raise ValueError(f"{', '.join(nameless)}: give it a name in the MJCF and fit again to find it by a prefix")
-        fit = {**fit, "table": [{**row, "name": prefix + row["name"]} for row in fit["table"]]}
+        prefixed = {part: [{**of, "name": prefix + of["name"]} for of in fit.get(part, ())] for part in _NAMED}
+        fit = {**fit, **prefixed}
     written, names = copy.copy(model), [p["name"] for p in fit["parameters"]]
     old = {field: getattr(model, field) for field in dir(model) if field.startswith(_OF_ELEMENTS)}
     old = {field: array for field, array in old.items() if np.asarray(array).dtype.kind == "f"}
@@ -274,8 +278,24 @@ def _write(model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float])
         mujoco.mj_setConst(model, mujoco.MjData(model))
         model.stat.meaninertia = model.dof_M0.mean()
         model.stat.meanmass = model.body_subtreemass[0] / max(model.nbody - 1, 1)
+    for geom in {_id(model, row) for row in fit["table"] if row["field"] == "geom_size"}:
+        _bound(model, geom)
     if fields & {"geom_pos", "geom_quat", "geom_size"}:  # boxes around several geoms stay as they were compiled
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+
+
+def _bound(model: mujoco.MjModel, geom: int) -> None:
+    """Radius and box around a geom of a primitive shape, as MuJoCo compiles them."""
+    x, y, z = model.geom_size[geom]
+    around = {
+        mujoco.mjtGeom.mjGEOM_SPHERE: ((x, x, x), x),
+        mujoco.mjtGeom.mjGEOM_CAPSULE: ((x, x, x + y), x + y),
+        mujoco.mjtGeom.mjGEOM_CYLINDER: ((x, x, y), math.hypot(x, y)),
+        mujoco.mjtGeom.mjGEOM_ELLIPSOID: ((x, y, z), max(x, y, z)),
+        mujoco.mjtGeom.mjGEOM_BOX: ((x, y, z), math.sqrt(x**2 + y**2 + z**2)),
+    }.get(mujoco.mjtGeom(int(model.geom_type[geom])))
+    if around is not None:
+        model.geom_aabb[geom, 3:], model.geom_rbound[geom] = around
 
 
 def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any]) -> None:
@@ -292,6 +312,13 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
             entry = _entry(model, row)
             numbers = np.atleast_1d(getattr(model, field)[entry[0]])
             if field in _PLACE:
+                if row["element"] == "geom":
+                    if model.geom_type[number] in _SHAPED:
+                        raise ValueError(
+                            f"geom {row['name'] or number!r} has the frame of its mesh: write into its compiled MjModel"
+                        )
+                    if model.geom_bodyid[number]:  # whose weight a compiler would derive from its geoms
+                        weighed.add(int(model.geom_bodyid[number]))
                 _unplace(element)
                 for each in ("pos", "quat", "size"):
                     if hasattr(element, each):
@@ -448,8 +475,10 @@ class Laws:
 
 
 def _drive(model: mujoco.MjModel, joint: int) -> int:
-    """The actuator of a joint."""
-    return int(np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0))[0])
+    """The actuator of a joint; of several the one that follows a place."""
+    own = (model.actuator_trnid[:, 0] == joint) & np.isin(model.actuator_trntype, _AT_JOINT)
+    follows = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
+    return int(np.flatnonzero(own & follows if (own & follows).any() else own)[0])
 
 
 class _Goal:

@@ -110,7 +110,12 @@ def neutral_json(
     named = dict(zip(space.names, np.asarray(values, float).tolist(), strict=True))
     intervals = dict(zip(space.names, np.stack(gaussian.interval(0.9), axis=1).tolist(), strict=True))
     priors = dict(zip(space.names, np.stack(prior(space).interval(0.9), axis=1).tolist(), strict=True))
-    rows = _rows(scene, space, effects, np.asarray(values), made)
+    deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
+    laws = [e for e in effects if e.profile or e.command or e.servo or e.force or e.frictionloss]
+    fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
+    tables = list(law_tables(scene, fitted, laws, named, deviations))
+    dry = [t.joint for t in tables if isinstance(t, LawTable) and t.acts == "frictionloss"]
+    rows = _rows(scene, space, effects, np.asarray(values), made, dry)
     drawn = [dict(zip(space.names, row, strict=True)) for row in gaussian.sample(0, DRAWS).tolist()]
     inertias = _inertias(scene, space)
     for row in rows:
@@ -118,10 +123,6 @@ def neutral_json(
         row["prior"] = _interval(row, priors, [])
     for inertia in inertias:
         _weigh(rows, inertia, named, drawn)
-    deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    laws = [e for e in effects if e.profile or e.command or e.servo or e.force or e.frictionloss]
-    fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
-    tables = list(law_tables(scene, fitted, laws, named, deviations))
     at = {(row["field"], *row["own"]): row for row in rows}
     changes = [
         {**asdict(c), "interval": None, "unit": ""} | _of_row(at.get((c.field, *c.entry)), c.before, c.after)
@@ -199,9 +200,16 @@ def _parameter(p: Parameter, value: float, interval: list[float]) -> dict[str, A
 
 
 def _rows(
-    scene: Scene, space: Space, effects: Sequence[Effect], values: np.ndarray, made: FittedFiles | None
+    scene: Scene,
+    space: Space,
+    effects: Sequence[Effect],
+    values: np.ndarray,
+    made: FittedFiles | None,
+    dry: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """A row for every number of the model that parameters write, and those in which an MJCF states a law."""
+    """A row for every number of the model that parameters write, those in which an MJCF states a law, and those that a
+    fit changed besides; dry: joints with a law of friction.
+    """
     writes: dict[tuple[str, tuple[int, ...]], list[dict[str, Any]]] = {}
     for p in space.parameters:
         for w in p.writes:
@@ -215,6 +223,11 @@ def _rows(
     for effect in effects:  # its law has a table; the number that the MJCF has for it goes back
         for field, row in native(effect, space, values, model) or {}:
             writes.setdefault((field, (int(row),)), [])
+    for joint in scene.held:  # whose friction the fit held, and creeps as the MJCF has it
+        for k in range(2):
+            writes.setdefault(("dof_solimp", (scene.dof(joint), k)), [])
+    for joint in dry:  # `Laws` works on this number, and starts from the fit's each time
+        writes.setdefault(("dof_frictionloss", (scene.dof(joint),)), [])
     said = {(c.field, c.entry): (c.attribute, c.index) for c in (made.changes if made else ())}
     return [_row(scene, field, index, of, said) for (field, index), of in writes.items()]
 
@@ -342,7 +355,7 @@ def _lacking(
             why = (
                 "`forces` of apply_fit.py has its law"
                 if table
-                else without or "it changes what is read, not what moves"
+                else without or ("it changes what is read, not what moves" if effect.observe else "it has no table")
             )
             why = f"{effect.description}; {why}"
         elif p.writes:

@@ -269,6 +269,8 @@ def prepare(
         if commanded and not judges
         else make_cost(scene, full, held, engine=engine.engine, config=plain, effects=effects, check=False)
     )
+    if judges:
+        _check_start(heldout, full)
     begun = [beginning(recording, config.beginning) for recording in fitted]
     early = base
     if any(short is not recording for short, recording in zip(begun, fitted, strict=True)):

@@ -34,7 +34,7 @@ from droid_jax.files import (
 )
 from droid_jax.identify.fit import on_bound
 from droid_jax.identify.gaussian import prior
-from droid_jax.identify.holdout import NOISE_UNITS
+from droid_jax.identify.holdout import NOISE_UNITS, HeldoutDistance
 from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.identify.pipeline import Identified
 from droid_jax.identify.solution_checks import solution_notes
@@ -150,7 +150,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             "unit": NOISE_UNITS if whitened else unit,
         },
         "heldout_distances": {
-            name: asdict(distance) | {"errors": errors_json(distance.errors)}
+            name: asdict(distance) | per_joint(distance) | {"errors": errors_json(distance.errors)}
             for name, distance in found.heldout_distances.items()
         },
         "distance_unit": unit,
@@ -170,6 +170,12 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
             for name, check in found.checks.items()
         },
     }
+
+
+def per_joint(distance: HeldoutDistance) -> dict[str, list[float | None]]:
+    """Numbers of each joint; None where the simulation of what judges blew up."""
+    each = {"per_joint_before": distance.per_joint_before, "per_joint_after": distance.per_joint_after}
+    return {name: [finite(v) for v in values] for name, values in each.items()}
 
 
 def _write_history(folder: Path, found: Identified) -> None:

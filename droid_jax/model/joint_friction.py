@@ -26,6 +26,7 @@ SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
 GAIN = Role.TORQUE_GAIN.value
 TERMS = tuple(role.value for role in OF_A_JOINT)
 _UNITS = {Role.VISCOUS: "N m s/rad", Role.COULOMB: "N m", Role.TORQUE_OFFSET: "N m", Role.TORQUE_GAIN: "-"}
+_SLIDES = {"N m s/rad": "N s/m", "N m": "N"}  # the same on a joint that slides
 _GROUPS = {Role.TORQUE_GAIN: "Sensors"}
 _DEVIATIONS = {Role.VISCOUS: 0.3, Role.COULOMB: 0.5, Role.TORQUE_OFFSET: 0.3}  # of the prior
 
@@ -81,16 +82,26 @@ def joint_friction_space(joints: Sequence[str]) -> Space:
 
 
 def sensor_parameter(
-    joints: Sequence[str], term: str, joint: str, *, std: float, high: float, low: float | None = None, **options: Any
+    joints: Sequence[str],
+    term: str,
+    joint: str,
+    *,
+    std: float,
+    high: float,
+    low: float | None = None,
+    slides: bool = False,
+    **options: Any,
 ) -> Parameter:
     """One of those parameters with a prior deviation and bounds of its own (low: -high unless given).
 
-    options: nuisance, group.  Raises ValueError for an unknown term or joint.
+    slides: the joint does, so that its unit is N.  options: nuisance, group.
+    Raises ValueError for an unknown term or joint.
     """
     if term not in TERMS:
         raise ValueError(f"unknown sensor term {term!r}; valid: {', '.join(TERMS)}")
     if joint not in joints:
         raise ValueError(f"unknown joint {joint!r}; measured joints: {', '.join(joints)}")
     role = Role(term)
-    options = {"unit": _UNITS[role], "mean": 0.0, "group": _GROUPS.get(role, "Joint friction"), **options}
+    unit = _SLIDES.get(_UNITS[role], _UNITS[role]) if slides else _UNITS[role]
+    options = {"unit": unit, "mean": 0.0, "group": _GROUPS.get(role, "Joint friction"), **options}
     return Parameter(role.in_theta(joint), std=std, low=-high if low is None else low, high=high, **options)

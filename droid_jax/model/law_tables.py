@@ -145,6 +145,8 @@ class _Law:
 
     def delay(self) -> LawTable | NoTable:
         """How late the command comes, s."""
+        if self.effect.over_time:
+            return self.without("it goes by the time since the recording began")
         command = self.effect.command
         assert command is not None
 
@@ -174,6 +176,9 @@ class _Law:
         base = base + rng.uniform(-0.5, 0.5, base.shape)
         at = {n: np.full(PROBES, self.probe(n)) for n in self.parameters}
         now = function(at, base)
+        if not np.abs(now).max() > 0:
+            yield self.without("it does not act near the scene's own pose, where its table would be made")
+            return
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
             other = base.copy()

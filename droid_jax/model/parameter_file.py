@@ -238,7 +238,8 @@ def _single(scene: Scene, given: Mapping[str, Any]) -> Parameter:
         _check_measured(scene, element)
         return joint_encoder_offset(scene, element, **options)
     if sensor is not None:
-        return sensor_parameter(scene.joints, sensor, element, **options)
+        _check_measured(scene, element)
+        return sensor_parameter(scene.joints, sensor, element, slides=scene.slides(element), **options)
     if field == "body_mass" and options.get("mode", Mode.SET) is Mode.SET:
         options.pop("mode", None)
         return body_mass(scene, element, **options)

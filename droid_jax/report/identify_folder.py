@@ -132,8 +132,8 @@ class DistanceEntry(Struct, frozen=True, kw_only=True):
     noise_floor: float | None = None
     closed: float | None = None
     judged: Literal["repeats", "time", "same", "recordings"] = "repeats"  # or the log's last part, what was fitted
-    per_joint_before: list[float]
-    per_joint_after: list[float]
+    per_joint_before: list[float | None]
+    per_joint_after: list[float | None]
     per_joint_noise_floor: list[float] | None = None
     per_joint_unit: str = "N m"
     channels: list[str] = field(default_factory=lambda: ["torque"])

@@ -121,8 +121,8 @@ def residuals(
 @styled
 def distance_per_joint(
     joints: Sequence[str],
-    before: Sequence[float],
-    after: Sequence[float],
+    before: Sequence[float | None],
+    after: Sequence[float | None],
     floor: float | None,
     floors: Sequence[float] | None = None,
     unit: str = "N m",
@@ -137,8 +137,8 @@ def distance_per_joint(
     figure = Figure(figsize=(width, 2.7), layout="constrained")
     axes = figure.add_subplot()
     x = np.arange(len(joints))
-    axes.bar(x - 0.2, before, 0.36, color=BEFORE, label="before the fit")
-    axes.bar(x + 0.2, after, 0.36, color=AFTER, label="after the fit")
+    axes.bar(x - 0.2, np.array(before, float), 0.36, color=BEFORE, label="before the fit")
+    axes.bar(x + 0.2, np.array(after, float), 0.36, color=AFTER, label="after the fit")
     if floors is not None:
         axes.hlines(floors, x - 0.42, x + 0.42, color=MEASURED, linewidth=1.6, label="noise floor (repeats)")
     elif floor is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,10 @@ from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
 from droid_jax.identify.neutral_result import with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
-from droid_jax.model.effects.registry import effect_space, library, ready
+from droid_jax.model.effects.registry import effect_space, joined, library, ready
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.law_tables import NoTable, law_tables
+from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
 from droid_jax.model.scene import Scene, load_scene
@@ -295,6 +296,110 @@ def test_it_moves_as_the_replay_does(made: Made, tmp_path: Path):
     scene = made.scene
     np.testing.assert_allclose(answer["qpos"][:, scene.joint_qpos], own.position, atol=1e-3)
     np.testing.assert_allclose(answer["torque"][:, scene.joint_dofs], own.torque, atol=0.05)
+
+
+def test_a_friction_law_starts_from_the_fits_number_each_time(made: Made):
+    """Whatever an earlier law left in the model; a draw after the other."""
+    model = mujoco.MjModel.from_xml_path(str(SCENE))
+    data = mujoco.MjData(model)
+    data.qvel[:] = 1.0
+    mujoco.mj_forward(model, data)
+    left = []
+    for _ in range(3):
+        laws = apply_fit.forces(model, made.fit, apply_fit.apply(model, made.fit))
+        laws(model, data)
+        left.append(model.dof_frictionloss.copy())
+    np.testing.assert_allclose(left[1:], [left[0]] * 2, rtol=1e-12)
+
+
+ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
+<geom name="table" type="plane" size="1 1 .1" pos="0 0 -.5"/>
+<body name="rod"><joint name="turn" axis="0 1 0" frictionloss="0.3" armature="0.01"/>
+<geom name="tip" size=".05" pos="0 0 -.3" mass="0.4"/>
+<geom name="bar" type="capsule" size=".02 .1" pos="0 0 -.1"/></body>
+</worldbody><actuator>{motor}<position name="turn" joint="turn" kp="20"/></actuator></mujoco>"""
+
+
+def fit_of_rod(folder: Path, entries: list[dict[str, Any]], motor: str = "", effects: Sequence[str] = ()) -> Any:
+    """A fit of the rod half a deviation off its prior, as fitted.json, with its scene."""
+    (folder / "rod.xml").write_text(ROD.format(motor=motor))
+    (folder / "parameters.json").write_text(json.dumps(entries))
+    scene = load_scene(folder / "rod.xml", hold=True)
+    chosen = library(scene, effects)
+    space = load_parameters(folder / "parameters.json", scene)
+    space = joined(space, chosen) if chosen else space
+    values = np.clip(space.mean + 0.5 * space.std, space.low, space.high)
+    assert write_neutral(folder, ready(scene), prior(space), values, chosen, main="fitted.xml") == ""
+    return apply_fit.load(folder / "fitted.json"), scene
+
+
+DAMPING = {"field": "dof_damping", "element": "turn", "std": 0.1, "high": 2.0}
+
+
+def test_friction_that_the_fit_held_is_held_where_it_is_applied(tmp_path: Path):
+    fit, scene = fit_of_rod(tmp_path, [DAMPING])
+    assert scene.held == ("turn",)
+    applied, written = (mujoco.MjModel.from_xml_path(str(tmp_path / n)) for n in ("rod.xml", "fitted.xml"))
+    assert applied.dof_solimp[0, 0] < 0.99
+    apply_fit.apply(applied, fit)
+    np.testing.assert_allclose(applied.dof_solimp, written.dof_solimp, rtol=1e-6)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "rod.xml"))
+    apply_fit.apply(spec, fit)
+    np.testing.assert_allclose(spec.compile().dof_solimp, written.dof_solimp, rtol=1e-6)
+
+
+def test_a_batch_finds_whole_inertias_by_their_prefix(tmp_path: Path):
+    fit, _ = fit_of_rod(tmp_path, [{"inertia": "rod", "std": 0.2}])
+    house = mujoco.MjSpec()
+    frame = house.worldbody.add_frame()
+    frame.attach_body(mujoco.MjSpec.from_file(str(tmp_path / "rod.xml")).body("rod"), "robot/", "")
+    found = apply_fit.batch(house.compile(), fit, 3, prefix="robot/")
+    alone = apply_fit.batch(mujoco.MjModel.from_xml_path(str(tmp_path / "rod.xml")), fit, 3)
+    np.testing.assert_allclose(found["body_mass"][:, -1], alone["body_mass"][:, -1])
+
+
+def test_a_geom_that_grew_is_found_by_contacts(tmp_path: Path):
+    """Its bound is that of the compiler, and the body keeps its fitted weight."""
+    size = {
+        "field": "geom_size",
+        "element": "tip",
+        "column": 0,
+        "std": 0.3,
+        "high": 1.0,
+        "name": "tip_size",
+        "unit": "m",
+    }
+    fit, _ = fit_of_rod(tmp_path, [size])
+    model, spec = (kind(str(tmp_path / "rod.xml")) for kind in (mujoco.MjModel.from_xml_path, mujoco.MjSpec.from_file))
+    apply_fit.apply(model, fit)
+    mass = float(model.body_mass[-1])
+    apply_fit.apply(spec, fit)
+    compiled = spec.compile()
+    tip = model.geom("tip").id
+    assert model.geom_size[tip, 0] == pytest.approx(0.2) and compiled.body_mass[-1] == pytest.approx(mass)
+    np.testing.assert_allclose(model.geom_rbound, compiled.geom_rbound)
+    contacts = []
+    for each in (model, compiled):
+        data = mujoco.MjData(each)
+        mujoco.mj_forward(each, data)
+        contacts.append(data.ncon)
+    assert contacts == [1, 1]
+
+
+def test_a_law_of_a_servo_finds_it_behind_a_motor(tmp_path: Path):
+    motor = '<motor name="ahead" joint="turn"/>'
+    fit, _ = fit_of_rod(tmp_path, [DAMPING], motor, ["profile_speed"])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "rod.xml"))
+    laws, data = apply_fit.forces(model, fit), mujoco.MjData(model)
+    laws.control(data, [0.0, 0.0])
+    data.time = 0.01
+    assert laws.control(data, [1.0, 1.0])[0] == 1.0 and laws.control(data, [1.0, 1.0])[1] < 1.0
+
+
+def test_a_law_over_time_is_no_delay(tmp_path: Path):
+    fit, _ = fit_of_rod(tmp_path, [DAMPING], effects=["clock_rate"])
+    assert not fit["laws"]
+    assert "time since the recording began" in next(e["why"] for e in fit["not_in_mjcf"] if "clock" in e["parameter"])
 
 
 def test_another_file_is_refused(tmp_path: Path, made: Made):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -141,3 +142,14 @@ def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
 
 def test_the_tests_pendulum_is_another_than_the_scenes():
     assert {p["name"] for p in PARAMETERS} == set(TRUE) and all(TRUE[n] != START[n] for n in TRUE)
+
+
+def test_a_judge_whose_simulation_blows_up_is_refused_before_the_fit(logs: SimpleNamespace):
+    soft = swung("soft", 1.0, 0.8)
+    assert soft.gains is not None
+    wild = replace(soft, name="wild", gains=replace(soft.gains, stiffness=soft.gains.stiffness * 1e9))
+    (logs.folder / "own.json").write_text(json.dumps(PARAMETERS))
+    space = load_parameters(logs.folder / "own.json", pendulum())
+    config = IdentifyConfig(compare=CompareConfig(channels={"position": 1.0}), engine="mujoco")
+    with pytest.raises(ValueError, match="the simulation of 'wild' blows up"):
+        prepare(pendulum(), space, [soft], judge_on=[wild], config=config)
