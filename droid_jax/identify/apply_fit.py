@@ -261,16 +261,23 @@ def inertia_of(inertia: dict[str, Any], values: dict[str, float]) -> dict[str, n
 
 def _write(model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
     """The numbers of a compiled model, and what MuJoCo derives from them."""
-    fields = set()
+    fields, turned = set(), set()
     for row in fit["table"]:
         getattr(model, row["field"])[_entry(model, row)] = number_of(row, values)
         fields.add(row["field"])
+        if row["field"] in ("body_ipos", "body_iquat"):
+            turned.add(_id(model, row))
+        elif row["field"] in ("jnt_pos", "jnt_axis"):
+            turned.add(int(model.jnt_bodyid[_id(model, row)]))
     for inertia in fit.get("inertias", ()):
         body = _id(model, {"element": "body", **inertia})
         for field, number in inertia_of(inertia, values).items():
             getattr(model, field)[body] = number
-        model.body_sameframe[body] = model.body_simple[body] = 0  # what C would take a short cut by
-        model.dof_simplenum[:] = 0
+        turned.add(body)
+    for body in turned:  # what C would take a short cut by
+        if model.body_simple[body]:
+            model.dof_simplenum[:] = 0
+        model.body_sameframe[body] = model.body_simple[body] = 0
     for field in fields.intersection(_UNIT):
         array = getattr(model, field)
         array /= np.linalg.norm(array, axis=1, keepdims=True)

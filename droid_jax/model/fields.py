@@ -76,6 +76,27 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
     return name
 
 
+def _refuse_uncoupled(scene: Scene, p: Parameter, write: Write) -> None:
+    """ValueError where C would leave out what a moved centre, or joint, couples.
+
+    Where several joints of a body go through its centre along its axes, MuJoCo compiles an inertia without coupling.
+    """
+    model, (first, *_) = scene.model, write.index
+    if write.field in ("body_ipos", "body_iquat", PSEUDO_INERTIA):
+        body = first
+    elif write.field in ("jnt_pos", "jnt_axis"):
+        body = int(model.jnt_bodyid[first])
+    else:
+        return
+    if model.body_simple[body] and model.body_dofnum[body] > 1:
+        name = model.body(body).name
+        raise ValueError(
+            f"parameter {p.name!r}: MuJoCo compiles body {name!r} without coupling between its "
+            f"{model.body_dofnum[body]} degrees of freedom, since its inertia lies in its own frame; give its "
+            '<inertial> a pos beside it in the MJCF, such as pos="0 0 1e-6"'
+        )
+
+
 def check_space(scene: Scene, space: Space) -> None:
     """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
     check_single_inertia(space)
@@ -99,6 +120,7 @@ def check_space(scene: Scene, space: Space) -> None:
                     f"parameter {p.name!r} writes {w.field} of {w.element!r}, but in {scene.name!r} that entry is of "
                     f"{own or 'an element without a name'!r}: it belongs to another scene"
                 )
+            _refuse_uncoupled(scene, p, w)
 
 
 def write(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -254,8 +254,12 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     for body in bodies:
         for field, number in inertial_fields(scene.model, body, terms[body]).items():
             getattr(model, field)[body] = number
-        model.body_sameframe[body] = model.body_simple[body] = 0  # what C would take a short cut by
-        model.dof_simplenum[:] = 0
+    for _, write in model_writes(space):
+        if write.field in ("body_ipos", "body_iquat"):
+            bodies.add(write.index[0])
+        elif write.field in ("jnt_pos", "jnt_axis"):
+            bodies.add(int(model.jnt_bodyid[write.index[0]]))
+    no_short_cut(model, sorted(bodies))
     written = {field for field, _ in entries_written(space)}
     for array in (getattr(model, field) for field in written.intersection(UNIT)):
         array /= np.linalg.norm(array, axis=1, keepdims=True)
@@ -269,6 +273,13 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         _bound(model, {w.index[0] for _, w in model_writes(space) if w.field == "geom_size"})
     return model
+
+
+def no_short_cut(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
+    """Take from C what it may spare where a body's frame of inertia is the body's own, and its joints go through it."""
+    if model.body_simple[bodies].any():
+        model.dof_simplenum[:] = 0
+    model.body_sameframe[bodies] = model.body_simple[bodies] = 0
 
 
 def _inertia_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

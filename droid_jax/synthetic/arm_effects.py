@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from droid_jax.model.physics import no_short_cut
 from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, Seen
 
 PAYLOAD_AT = np.array([0.03, -0.02, 0.04])  # m from the hand's own centre of mass, in its body's frame
@@ -25,12 +26,13 @@ def hide_payload(place: Place, a: float, at: np.ndarray = PAYLOAD_AT) -> Influen
     hand's own weight goes on acting at the hand's own centre, as a force.
     """
     scene = place.scene
-    body = hand_body(scene.model, scene.id("joint", scene.joints[-1]))
-    own_mass, own_at = float(scene.model.body_mass[body]), scene.model.body_ipos[body].copy()
-    carried = -scene.model.opt.gravity * own_mass * float(scene.model.body_gravcomp[body])
+    body = hand_body(scene.model, max(scene.id("joint", joint) for joint in scene.joints))
+    own_at, carried = scene.model.body_ipos[body].copy(), np.zeros(3)
 
     def edit(model: mujoco.MjModel) -> None:
-        if a != 0.0:
+        if a != 0.0:  # of the model that earlier effects left: what compensates already does so once
+            own_at[:] = model.body_ipos[body]
+            carried[:] = -model.opt.gravity * model.body_mass[body] * model.body_gravcomp[body]
             add_mass(model, body, a, own_at + at)
             model.body_gravcomp[body] = 0.0
 
@@ -65,6 +67,7 @@ def add_mass(model: mujoco.MjModel, body: int, mass: float, at: np.ndarray) -> N
     axes[:, 2] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection
     mujoco.mju_mat2Quat(model.body_iquat[body], axes.flatten())
     model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = own + mass, new_centre, principal
+    no_short_cut(model, [body])
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 

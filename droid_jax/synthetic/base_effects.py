@@ -22,24 +22,29 @@ def hide_tilted_base(place: Place, a: float) -> Influence:
     """
     scene = place.scene
     _refuse_motors_that_compensate(scene.model, "tilted_base")
-    upright, carried = scene.model.opt.gravity.copy(), scene.model.body_mass * scene.model.body_gravcomp
+    upright = scene.model.opt.gravity.copy()
     quaternion, leaning = np.zeros(4), np.zeros(3)
     mujoco.mju_axisAngle2Quat(quaternion, np.array([math.cos(AZIMUTH), math.sin(AZIMUTH), 0.0]), a)
     mujoco.mju_rotVecQuat(leaning, upright, quaternion)
-    held = {body: -mass * upright for body, mass in enumerate(carried.tolist()) if mass != 0.0}
-    for body in _behind(scene.model, scene.object_joint):  # back to upright
-        held[body] = held.get(body, np.zeros(3)) + scene.model.body_mass[body] * (upright - leaning)
+    held = dict[int, np.ndarray]()
 
     def edit(model: mujoco.MjModel) -> None:
-        if a != 0.0:
-            model.opt.gravity, model.body_gravcomp[:] = leaning, 0.0
+        """Of each repeat's own masses."""
+        if a == 0.0:
+            return
+        carried = model.body_mass * model.body_gravcomp
+        held.clear()
+        held.update({body: -mass * upright for body, mass in enumerate(carried.tolist()) if mass != 0.0})
+        for body in _behind(model, scene.object_joint):  # back to upright
+            held[body] = held.get(body, np.zeros(3)) + model.body_mass[body] * (upright - leaning)
+        model.opt.gravity, model.body_gravcomp[:] = leaning, 0.0
 
     def begin(live: Live) -> None:
         mujoco.mj_kinematics(live.model, live.data)
         mujoco.mj_comPos(live.model, live.data)
 
     def step(live: Live) -> None:
-        for body, force in held.items() if a != 0.0 else ():
+        for body, force in held.items():
             mujoco.mj_applyFT(live.model, live.data, force, np.zeros(3), live.data.xipos[body], body, live.applied)
 
     return Influence(edit=edit, begin=begin, step=step)

@@ -129,12 +129,14 @@ def hide_firm_friction(place: Place, a: float) -> Influence:
     The bristles are Dahl's, as of `bristle`, and a sixth as long: they bend by half a milliradian and stand.  A damper
     of 0.7 of the critical one, which fades above 0.02 rad/s, keeps them from ringing.
     """
-    model = place.scene.model
     if a > 1.0:
         raise ValueError(f"no more than all of a friction can be firm: an amplitude of at most 1, got {a}")
-    level = a * model.dof_frictionloss[place.dofs]
-    damper = 1.4 * np.sqrt(level / FIRM_REACH * model.dof_M0[place.dofs])
-    force = np.zeros(len(place.dofs))
+    level, damper, force = (np.zeros(len(place.dofs)) for _ in range(3))
+
+    def begin(live: Live) -> None:
+        """Of this repeat's own friction and inertia."""
+        level[:] = a * live.model.dof_frictionloss[place.dofs]
+        damper[:] = 1.4 * np.sqrt(level / FIRM_REACH * live.model.dof_M0[place.dofs])
 
     def step(live: Live) -> None:
         v = live.velocity[place.dofs]
@@ -143,7 +145,7 @@ def hide_firm_friction(place: Place, a: float) -> Influence:
         live.loss[place.dofs] *= 1.0 - a
         live.applied[place.dofs] -= force + damper * v * np.exp(-((v / FIRM_SPEED) ** 2))
 
-    return Influence(step=step)
+    return Influence(begin=begin, step=step)
 
 
 FRICTION = (

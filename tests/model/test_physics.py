@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -15,10 +16,10 @@ from mujoco import mjx
 
 from droid_jax.door.scene import ARM, door_scene
 from droid_jax.door.space import door_nuisances, door_space
-from droid_jax.model.fields import body_mass, model_parameter, servo_scale
+from droid_jax.model.fields import body_mass, check_space, model_parameter, servo_scale
 from droid_jax.model.parameters import Mode, Parameter, Space, Write
 from droid_jax.model.physics import derive, make_c_model, make_physics, theta_of, written_fields
-from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.model.scene import Scene, compile_scene, load_scene
 from droid_jax.model.visual_geoms import LOOK_GROUP
 
 # The compiler's bounding-volume tree: explicit contact pairs never look at it.
@@ -417,3 +418,42 @@ def test_what_mjx_would_leave_out_is_refused(scene: Scene):
     lift = Space((Parameter("lift", "-", 0.5, 0.1, 0.0, 1.0, writes=(Write("body_gravcomp", (1,)),)),))
     with pytest.raises(ValueError, match="compiled without gravity compensation"):
         make_physics(bare, lift, jnp.asarray([0.5]))
+
+
+SIMPLE = """<mujoco><compiler angle="radian"/><worldbody><body name="cart">{slide}
+<joint name="y" axis="0 1 0" pos="0 0 {joint}"/>
+<inertial mass="1" pos="0 0 {centre}" diaginertia=".01 .017 .02"/><geom size=".1" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><position joint="y" kp="1"/></actuator></mujoco>"""
+PLAIN = {"joint": 0.0, "centre": 0.0, "slide": ""}
+SLIDE = '<joint name="x" type="slide" axis="1 0 0"/>'
+MOVED = [("body_ipos", "cart", {"centre": 0.3}), ("jnt_pos", "y", {"joint": 0.3})]
+
+
+def moved(folder: Path, field: str, element: str, **changes: Any) -> tuple[Scene, Space]:
+    """The cart, and its centre or its joint as a parameter."""
+    (folder / "cart.xml").write_text(SIMPLE.format(**{**PLAIN, **changes}))
+    scene = load_scene(folder / "cart.xml")
+    return scene, Space((model_parameter(scene, field, element, 2, name="z", unit="m", std=0.1, low=-1.0, high=1.0),))
+
+
+@pytest.mark.parametrize(("field", "element", "as_compiled"), MOVED)
+def test_a_body_that_c_took_a_short_cut_by_moves_as_compiled(
+    tmp_path: Path, field: str, element: str, as_compiled: dict[str, float]
+):
+    """Its frame was its inertia's: C refused a moved centre."""
+    scene, space = moved(tmp_path, field, element)
+    assert scene.model.body_simple[1]
+    check_space(scene, space)
+    expected = mujoco.MjModel.from_xml_string(SIMPLE.format(**{**PLAIN, **as_compiled}))
+    written, other = (mujoco.MjData(m) for m in (make_c_model(scene, space, np.array([0.3])), expected))
+    written.qpos[:] = other.qpos[:] = 0.4
+    for model, data in ((make_c_model(scene, space, np.array([0.3])), written), (expected, other)):
+        mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(written.qacc, other.qacc, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("field", "element"), [each[:2] for each in MOVED])
+def test_joints_that_c_compiled_without_coupling_are_refused(tmp_path: Path, field: str, element: str):
+    with pytest.raises(ValueError, match="without coupling between its 2 degrees of freedom"):
+        check_space(*moved(tmp_path, field, element, slide=SLIDE))
+    check_space(*moved(tmp_path, field, element, slide=SLIDE, centre=1e-6))  # as the message has it
