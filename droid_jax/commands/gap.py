@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -253,9 +253,12 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     return base.values({n: v for n, v in known.items() if n in base.names})
 
 
-def chosen_effects(command: GapCommand, scene: Scene, recordings: list[Recording]) -> tuple[Effect, ...]:
+def chosen_effects(
+    command: GapCommand, scene: Scene, recordings: list[Recording], channels: Sequence[str] = ()
+) -> tuple[Effect, ...]:
     """The library's effects for this scene, --effects and --without applied.
 
+    channels: that are compared, where it is not the recordings that tell.
     Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
     """
     from droid_jax.discrepancy.candidates import observable_effects
@@ -264,7 +267,9 @@ def chosen_effects(command: GapCommand, scene: Scene, recordings: list[Recording
 
     library(scene, command.without)  # names are checked there
     config = gap_config(command)
-    channels = comparing(scene, recordings, config).compare.channels if recordings else command.compare or ("torque",)
+    if not channels:
+        compared = comparing(scene, recordings, config).compare.channels if recordings else command.compare
+        channels = tuple(compared) or ("torque",)
     here = observable_effects(scene, recordings, command.effect_scale, channels)
     asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in here}

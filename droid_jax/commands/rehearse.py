@@ -112,7 +112,7 @@ def run(command: Rehearse) -> None:
     scene, base = gap_model(gap)
     recordings = rehearsed_recordings(command)
     plan = plan_of(command, base, fit)
-    effects = chosen_effects(gap, scene, [] if plan.channels else recordings)
+    effects = chosen_effects(gap, scene, recordings, plan.channels or ())
     config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
     found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
     setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}

@@ -130,6 +130,7 @@ def search_effects(
     state = SearchState(base)
     while not state.finished:
         state, _ = selection_step(state, problem)
+    tested = state.model if state.steps and state.steps[-1].selected is None else None  # what the last test was of
     state = pair_step(state, problem)
     model = pruned(problem, state.model)
     model, converging = converged_model(problem, model)
@@ -141,10 +142,23 @@ def search_effects(
         model,
         state.steps,
         discretisation_error,
-        exhausted=state.exhausted,
+        exhausted=state.exhausted if tested is not None and tested.keys == model.keys else _explained(problem, model),
         failed=notes.failed,
         not_tried=notes.not_tried,
     )
+
+
+def _explained(problem: Problem, model: FittedModel) -> bool:
+    """Whether a score test finds nothing beside a model of which none was made: its last effects came two at a time, or
+    were as many as a search may take.
+    """
+    case, asked = problem.case, open_directions(problem.directions, model)
+    if not asked:
+        return True
+    problem.progress("score_test", model.name)
+    found = score_test(case.train, model, asked, case.config.seed)
+    significant = found.p < case.config.selection.significance
+    return not (significant and more_than_step_error(case, model, found, problem.discretisation_error))
 
 
 def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, SelectionStep | None]:
@@ -430,6 +444,8 @@ def polished(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
 def _continued(problem: Problem, model: FittedModel, config: RefineConfig, note: str) -> tuple[FittedModel, Notes]:
     """`model` fitted further; unchanged where the result cannot be replayed on the validation motion."""
     found = _refit(problem, model.parts, model.values, config, note)
+    if model.refined.converged and not found.refined.converged:
+        return model, Notes()  # it had arrived already
     if np.isfinite(problem.case.validation.common(found.values)).all():
         return found, Notes()
     return model, Notes(failed=(model.name + note,))
@@ -482,8 +498,9 @@ def without_small_gains(
         if {r.reason for r in tests[k].reasons} - WEAK != {Reason.SMALL_GAIN} or taken < needed or problem.late:
             continue
         problem.progress("score_test", tried[k].name)
-        found = score_test(case.train, tried[k], open_directions(problem.directions, tried[k]), case.config.seed)
-        if found.p < case.config.selection.significance:
-            break  # what explains less leaves more
+        if asked := open_directions(problem.directions, tried[k]):
+            found = score_test(case.train, tried[k], asked, case.config.seed)
+            if found.p < case.config.selection.significance:
+                break  # what explains less leaves more
         out[k] = replace(tests[k], reasons=tuple(r for r in tests[k].reasons if r.reason is not Reason.SMALL_GAIN))
     return out

@@ -330,13 +330,15 @@ def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: An
 
 
 def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) -> Parameter:
-    """Factor on the position gain of a joint's servo, 1 at nominal."""
+    """Factor on the position gain of a joint's servo, or on that of one that follows a speed alone; 1 at nominal."""
     if joint not in scene.driven_joints:
         raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.driven_joints)}")
     actuator = scene.command_names.index(joint)
+    bias = scene.model.actuator_biasprm[actuator]
+    feedback = 2 if bias[1] == 0 and bias[2] == -scene.model.actuator_gainprm[actuator, 0] else 1
     writes = (
         write(scene, "actuator_gainprm", (actuator, 0), Mode.SCALE),
-        write(scene, "actuator_biasprm", (actuator, 1), Mode.SCALE),
+        write(scene, "actuator_biasprm", (actuator, feedback), Mode.SCALE),
     )
     options = {"name": f"{joint}_servo_scale", "unit": "-", "mean": 1.0, "low": 0.5, "high": 1.5, **options}
     return Parameter(std=std, writes=writes, **options)

@@ -37,7 +37,7 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
     found: list[Finding] = []
     found += _said("range", lambda: check_range(scene, recording))
     found += check_log(scene, recording)
-    if not found or found[0].kind != "range":
+    if not any(f.kind == "range" and f.severity == "certain" for f in found):
         found += _said("scene", lambda: _replayable(scene, recording, motion_cutoff))
     if recording.command.size:
         found += _said("start", lambda: warn_if_moving(recording))

@@ -61,6 +61,8 @@ def _dead(recording: Recording, where: str) -> list[Finding]:
     found = []
     for key, channel in ((k, recording.channels[k]) for k in moving):
         for c, joint in enumerate(channel.columns):
+            if not channel.mask[..., c].any():
+                continue  # nothing was measured
             by = next((other for other in others[key] if joint in moving.get(other, ())), None)
             if _span(channel, c) == 0 and by is not None and not (key == "position" and recording.command.size):
                 value = float(channel.values[..., c][channel.mask[..., c]][0])

@@ -146,6 +146,7 @@ class LinearModel:
     blocks how many times the recording's own length, times its blocks.
     minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
     base_low, base_high: [D] by how much the base parameters may move, search units; None: without bounds.
+    margin: [K] how far from its bound a coefficient must end to be named.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -159,11 +160,12 @@ class LinearModel:
     high: np.ndarray
     base_low: np.ndarray | None = None
     base_high: np.ndarray | None = None
+    margin: np.ndarray | float = 0.0
 
     @property
     def largest(self) -> np.ndarray:
-        """[K] largest size of each coefficient: upwards, or downwards where neutral is the upper bound."""
-        return np.where(self.high > 0, self.high, -self.low)
+        """[K] largest size of a coefficient that is named: upwards, or downwards where neutral is the upper bound."""
+        return np.where(self.high > 0, self.high, -self.low) - self.margin
 
     @property
     def sign(self) -> np.ndarray:
@@ -185,7 +187,16 @@ class LinearModel:
         train = replace(self.train, raw=self.train.raw[some])
         directions = tuple(self.directions[k] for k in some)
         minimum, low, high = (a[some] for a in (self.minimum, self.low, self.high))
-        return replace(self, directions=directions, train=train, validation=train, minimum=minimum, low=low, high=high)
+        margin = np.broadcast_to(self.margin, self.low.shape)[some]
+        return replace(
+            self, directions=directions, train=train, validation=train, minimum=minimum, low=low, high=high,
+            margin=margin,
+        )  # fmt: skip
+
+    @property
+    def judging_repeats(self) -> float:
+        """N of the validation part, where that of the training part is `repeats`: recordings may have other numbers."""
+        return self.repeats * self.validation.rows.units / self.train.rows.units if self.repeated else 1.0
 
     @property
     def step_error(self) -> float:
@@ -439,7 +450,7 @@ def imitations(model: LinearModel, k: int, size: float | None = None) -> list[Im
         share = float(coefficients @ (2 * along[rows] - gram @ coefficients)) / whole
         if key not in best or share > best[key].share:
             least = model.minimum[rows] / np.maximum(np.abs(coefficients) / times, 1e-30)
-            strength = whole / times**2 * (model.repeats if model.repeated else 1)
+            strength = whole / times**2 * model.judging_repeats
             best[key] = Imitation(key, share, strength, float(least.min()))
     return list(best.values())
 

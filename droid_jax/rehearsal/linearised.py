@@ -309,6 +309,7 @@ def linear_model(
     space, minimum, refined = case.full_space, case.minimum_sizes, base.refined
     low, high = (base.space.to_search(end) - refined.x for end in (base.space.low, base.space.high))
     of = [space[d.coefficient] for d in directions]
+    share = case.config.selection.bound_margin
     return LinearModel(
         directions=tuple(directions),
         train=replace(train, raw=np.nan_to_num(train.raw)),
@@ -321,6 +322,7 @@ def linear_model(
         high=np.array([p.high - p.mean for p in of]),
         base_low=low[refined.free],
         base_high=high[refined.free],
+        margin=np.array([0.0 if p.name in case.natural_bounds else share * (p.high - p.low) for p in of]),
     )
 
 

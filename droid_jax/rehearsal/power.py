@@ -111,9 +111,9 @@ def discrepancy_crossings(model: LinearModel, k: int, of: Leftover, config: Rehe
     """
     if not model.repeated:
         return np.zeros(config.draws)
-    rng, count, step_error = np.random.default_rng([config.seed, 3, k]), model.repeats, model.step_error
-    out = np.zeros(config.draws)
-    for part, factor, validation in ((model.train, WORST, False), (model.validation, 1.0, True)):
+    rng, step_error, out = np.random.default_rng([config.seed, 3, k]), model.step_error, np.zeros(config.draws)
+    parts = (model.train, WORST, model.repeats, False), (model.validation, 1.0, model.judging_repeats, True)
+    for part, factor, count, validation in parts:
         residuals = float(part.rows.counted.sum())
         along, beside = rng.normal(size=(2, config.draws))
         least = count * residuals * factor * step_error - np.sqrt(2 * residuals) * beside
@@ -193,6 +193,16 @@ def scatter(rows: Repeats, unit: np.ndarray, pooling: float) -> np.ndarray:
     return np.sqrt((freedom * own + pooling * pooled) / (freedom + pooling))
 
 
+def _some_flips(count: int, config: RehearsalConfig) -> np.ndarray:
+    """The search's sign flips of so many units, or some of them.
+
+    All of few units stand in order: the first of them would never turn the last units.
+    """
+    flips = sign_flips(count, config.seed)
+    some = np.random.default_rng([config.seed, 5]).permutation(len(flips) - 1)[: config.flips - 1]
+    return flips[np.r_[0, 1 + np.sort(some)]]
+
+
 def _of_repeats(
     model: LinearModel,
     unit: np.ndarray,
@@ -213,7 +223,7 @@ def _of_repeats(
     kept = value > 1e-9 * max(value.max(initial=0.0), 1e-30)
     root = deviation[:, None] * vector[:, kept] * np.sqrt(value[kept])  # [K, r]
     drawn = rng.normal(size=(config.draws, int(kept.sum()), count))
-    flips = sign_flips(count, config.seed)[: config.flips]
+    flips = _some_flips(count, config)
     balance = flips.mean(axis=1)[:, None, None].astype(np.float32)
     own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
 
@@ -261,7 +271,7 @@ def _of_blocks(
     config: RehearsalConfig,
 ) -> ScoreDraws:
     count, held = rows.units, model.prior * model.slack
-    flips = sign_flips(count, config.seed)[: config.flips]
+    flips = _some_flips(count, config)
     left = rows.left_after_flips(unit, model.train.base, held, flips)  # [F, K]
     inside = [np.flatnonzero(rows.block == b) for b in range(count)]
     drawn = model.train.noise(config.draws, rng)
@@ -321,7 +331,7 @@ def _repeats_gain(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Gains a m.e + a^2 m.m / 2 of each repeat are above zero by Student's t of their detrended scatter."""
-    count = model.repeats
+    count = max(2, round(model.judging_repeats))
     noise = scatter(rows, unit[None], config.pooling)[0] * rng.normal(size=(config.draws, count))
     straight = detrended(noise.T).T
     least = scipy.stats.t(max(count - 2, 1)).isf(search.selection.confirmation)

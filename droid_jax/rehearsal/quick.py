@@ -231,16 +231,28 @@ def improvements(
 
     for what, other, more in _variants(found):
         if not other.repeated and more > 1:
-            needed = np.array([max(e["limits"].values(), default=np.inf) for e in known]) / np.sqrt(more)
+            needed = np.array([_of_longer_log(e, more) for e in known]) * rehearsal.margin
             after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
         else:
             after = sizes(other, wanted)
         helped(what, before, after, _recovered(found, other, rehearsal, more))
     if faster is not None:  # of the training motion alone, as this one
-        moved, here = faster.model.of(found.compared), model.alone(every)
+        moved, here = faster.model.of(found.compared), without_step(model.alone(every))  # nor does the other know it
         rows = [every.index(k) for k in wanted]
         helped("the faster motion", sizes(here, rows), sizes(moved, rows), _recovered(faster, moved, rehearsal))
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
+
+
+def _of_longer_log(entry: Mapping[str, Any], more: float) -> float:
+    """What is asked for of a log so many times as long, without the margin: all but the smallest size that is named."""
+    least = entry["minimum"]
+    limits = {name: (limit, least if name == "minimum effect size" else 0.0) for name, limit in entry["limits"].items()}
+    return max((fixed + (limit - fixed) / np.sqrt(more) for limit, fixed in limits.values()), default=np.inf)
+
+
+def without_step(model: LinearModel) -> LinearModel:
+    """The model without what the time step leaves."""
+    return replace(model, train=replace(model.train, step=None), validation=replace(model.validation, step=None))
 
 
 def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list[tuple[Mapping[str, Any], int]]:

@@ -186,6 +186,7 @@ def servo_motion(
     fingers = finger_geoms(scene)
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
+    hinge_speed = scene.dof(scene.object_joint) if scene.object_joint else None
     shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
     half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
     damping = has_servo_damping(scene.model)
@@ -216,7 +217,7 @@ def servo_motion(
             torque,
             qpos[positions] + shift * drive.timestep * qvel[joints],
             (qvel + half * (after.qvel - qvel))[joints],
-            qpos[hinge] + shift * drive.timestep * qvel[hinge] if hinge is not None else jnp.zeros(()),
+            qpos[hinge] + shift * drive.timestep * qvel[hinge_speed] if hinge is not None else jnp.zeros(()),
             _touching(after, fingers),
         )
         kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))

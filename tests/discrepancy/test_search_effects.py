@@ -93,6 +93,7 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     )
     problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
     asked = dict(left)
+    monkeypatch.setattr(search, "open_directions", lambda *_: ("another",))
     monkeypatch.setattr(search, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name)))
     base: Any = SimpleNamespace(parts=())
     extended: Any = SimpleNamespace(parts=("drag",))
@@ -105,6 +106,18 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     )
     assert not asked  # each was asked once
     assert search.without_small_gains(problem, extended, models, tests) == tests  # beside another effect
+
+
+def test_where_nothing_else_could_be_asked_nothing_is_left_to_find():
+    """One effect at one place: no score test of no direction."""
+    model: Any = SimpleNamespace(name="a", parts=(), coefficients=())
+    small: Any = ValidationTest((), 0, 0.9, 0.88, 0.001, {}, 1.0, (Rejection(Reason.SMALL_GAIN, ""),))
+    case = SimpleNamespace(
+        train=SimpleNamespace(resampling=SimpleNamespace(repeated=False)), config=DiscrepancyConfig()
+    )
+    problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
+    (judged,) = search.without_small_gains(problem, SimpleNamespace(parts=()), [model], [small])  # type: ignore[arg-type]
+    assert judged.reasons == ()
 
 
 # From state to state -----------------------------------------------------------------------

@@ -16,6 +16,8 @@ def contact_compliance(scene: Scene) -> Effect | None:
     if scene.grip is None:
         return None
     pairs = [scene.id("pair", pair) for finger in scene.grip.fingers for pair in finger]
+    if (scene.model.pair_solref[pairs, 0] <= 0).any():  # stiffness and damping, and no time constant
+        return None
     writes = tuple(write(scene, "pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
     return Effect(
         "contact_compliance",

@@ -14,6 +14,7 @@ import numpy as np
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.effect_scaling import sized
 from droid_jax.model.fields import ENCODER
+from droid_jax.model.inertia import PSEUDO_INERTIA, WEIGHTS
 from droid_jax.model.joint_friction import GAIN
 from droid_jax.model.parameters import Scaling, Space
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
@@ -142,11 +143,15 @@ def joined(base: Space, effects: Iterable[Effect]) -> Space:
 def beside(base: Space, effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Effects less their places where the base has the sensor parameters that they would ask about.
 
-    A sensor's gain or an encoder's offset that is fitted as a parameter is no missing effect there.
+    A sensor's gain or an encoder's offset that is fitted as a parameter is no missing effect there, and neither is a
+    load on a body whose whole inertia is one.
     """
+    whole = {w.index[0] for p in base.parameters for w in p.writes if w.field == PSEUDO_INERTIA}
     taken = {f"{term}[{joint}]" for term in (GAIN, ENCODER) for joint in _joints_of(base)} & {*base.names}
     found = []
     for effect in effects:
+        if any(w.field in WEIGHTS and w.index[0] in whole for p in effect.parameters for w in p.writes):
+            continue
         if not taken & {p.name for p in effect.parameters}:
             found.append(effect)
             continue
