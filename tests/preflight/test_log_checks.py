@@ -371,3 +371,13 @@ def test_a_small_inertia_beside_friction_in_another_unit():
     assert check_log(heavy, opened(1.0, 3.0, 0.05)) == ()
     (milli,) = check_log(heavy, opened(1000.0, 3.0, 0.05))
     assert milli.kind == "units" and "of what the motion takes: are these milliamperes" in milli.sentence
+
+
+def test_a_column_that_was_never_measured_is_no_dead_one():
+    """A driver without that sensor writes nothing there; the joint's other channels move."""
+    right = recording()
+    torque = right.channels["torque"]
+    mask = torque.mask.copy()
+    mask[..., 0] = False
+    found = check_alone(replace(right, channels={**right.channels, "torque": replace(torque, mask=mask)}))
+    assert not [f for f in found if f.kind == "sensor"]

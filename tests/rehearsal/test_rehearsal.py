@@ -20,7 +20,7 @@ from droid_jax.commands.rehearse import plain
 from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.fitting import with_finer_step, with_step_difference
-from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p
+from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p, sign_flips
 from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import CmaConfig
@@ -44,8 +44,8 @@ from droid_jax.rehearsal.full import (
 from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, leftover
 from droid_jax.rehearsal.linearised import fine_steps, rehearsed
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
-from droid_jax.rehearsal.power import smallest_sizes
-from droid_jax.rehearsal.quick import quick_rehearsal
+from droid_jax.rehearsal.power import _some_flips, smallest_sizes
+from droid_jax.rehearsal.quick import _of_longer_log, quick_rehearsal
 from droid_jax.report.rehearsal_page import rehearsal_sentences
 from droid_jax.run import main
 
@@ -444,3 +444,35 @@ def test_complete_rehearsals_go_on_and_name_what_is_large(tmp_path: Path, hinge)
     assert run_case(of, case, tmp_path) == json.loads((tmp_path / case.name / "result.json").read_text())
     nothing = run_case(of, HiddenCase(0), tmp_path)
     assert nothing["effects"] == [] and [p["name"] for p in nothing["parameters"]] == ["door_damping"]
+
+
+def test_a_longer_log_asks_for_less_but_for_the_smallest_size_that_is_named():
+    entry = {"minimum": 0.3, "limits": {"score test": 1.0, "minimum effect size": 0.5}}
+    assert _of_longer_log(entry, 4.0) == pytest.approx(0.5)
+    assert _of_longer_log(entry, 1e6) == pytest.approx(0.3, rel=1e-2)
+
+
+@pytest.mark.parametrize("count", [8, 11, 12, 30])
+def test_the_flips_of_a_prediction_turn_every_unit(count: int):
+    flips = _some_flips(count, CONFIG)
+    assert len(flips) <= CONFIG.flips and np.all(flips[0] == flips[0, 0])
+    some, every = (np.mean(of == flips[0, 0], axis=0) for of in (flips, sign_flips(count, CONFIG.seed)))
+    np.testing.assert_allclose(some, every, atol=0.12)
+
+
+def test_what_a_validation_recording_says_goes_by_its_own_repeats():
+    few = Repeats(np.random.default_rng(5).normal(size=(4, LENGTH)))
+    model = of_repeats()
+    other = replace(model, validation=replace(model.validation, rows=few))
+    assert model.judging_repeats == REPEATS and other.judging_repeats == 4
+    (alike,), (less,) = (smallest_sizes(m, [1], CONFIG) for m in (model, other))
+    assert less.limits["time step"] > 1.3 * alike.limits["time step"]  # the square root of 10 / 4 is 1.6
+
+
+def test_an_effect_at_its_bound_is_not_found():
+    (plain,) = smallest_sizes(of_repeats(), [1], CONFIG)
+    high = np.full(DIRECTIONS, 1.01 * plain.size)
+    (inside,), (beyond,) = (
+        smallest_sizes(of_repeats(high=high, margin=margin), [1], CONFIG) for margin in (0.0, 0.02 * high)
+    )
+    assert np.isfinite(inside.size) and not np.isfinite(beyond.size)
