@@ -214,8 +214,8 @@ def _throughput(
     rows = []
     for population in sorted(compiled):
         _, median = interleave({"run": runs[population]}, REPEATS)
-        rows.append({**_row(population, steps, median["run"]), "peak_gib": peak_memory_gib()})
-        now.keep(rows=rows, steps_per_s=max(row["steps_per_s"] for row in rows))
+        rows.append(_row(population, steps, median["run"]))
+        now.keep(rows=rows, steps_per_s=max(row["steps_per_s"] for row in rows), peak_gib=peak_memory_gib())
 
 
 def _timed(run: Callable[[], Any]) -> float:
@@ -417,7 +417,7 @@ def main() -> None:
     path = arguments.out / f"{stem('gpu', arguments.quick)}.json"
     asked = [part for part in SHARES if part in arguments.only]
     machine = {"quick": arguments.quick, "commit": arguments.commit, "seed": arguments.seed}
-    if path.is_file() and (earlier := json.loads(path.read_text())).items() >= machine.items():
+    if arguments.commit and path.is_file() and (earlier := json.loads(path.read_text())).items() >= machine.items():
         parts |= earlier["parts"]
     with tempfile.TemporaryDirectory(prefix="gpu_") as cache:
         for number, part in enumerate(asked):

@@ -21,9 +21,10 @@ import platform
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from droid_jax import distributed
 from droid_jax.quiet import before_jax, import_mjx, quiet_cache
@@ -33,6 +34,7 @@ from droid_jax.storage import write_json
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 EMITTERS = "xla_cpu_use_fusion_emitters"
 # Allocations before a collection: a trace makes millions of small objects, and looking for cycles among them takes a
 # tenth of its time with Python's own (700, 10, 10).
@@ -101,6 +103,21 @@ def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Run
     else:
         os.environ["XLA_FLAGS"] = flags
     return Runtime(count, _EMITTERS_OFF in flags.split(), _use_cache(root, cache_dir))
+
+
+def in_full(function: Function) -> Function:
+    """The function, traced with exact matrix products (PRODUCTS) where nothing else is set, as without `tune`."""
+
+    @functools.wraps(function)
+    def traced(*given: Any, **named: Any) -> Any:
+        import jax
+
+        if _setting("jax_default_matmul_precision") is not None:
+            return function(*given, **named)
+        with jax.default_matmul_precision(PRODUCTS):
+            return function(*given, **named)
+
+    return cast(Function, traced)
 
 
 def compiler_options() -> dict[str, bool]:

@@ -692,7 +692,8 @@ def test_starting_over_forgets_another_commands_results(tmp_path: Path, before: 
     """Of the same command its own are forgotten alone, in a folder of several; what judged the fit goes with it."""
     for name in ("gap.json", "gaussian.json", "config.json", "evaluation.json", "notes.txt"):
         (tmp_path / name).write_text("{}")
-    (tmp_path / "setup.json").write_text(json.dumps({"command": before}))
+    # identify's own names no command
+    (tmp_path / "setup.json").write_text(json.dumps({} if before == "identify" else {"command": before}))
     begin(tmp_path, {"command": "identify"}, again=True, stage="identify")
     left = {p.name for p in tmp_path.iterdir()} - {"setup.json", "notes.txt"}
     assert left == set(kept) - {"gaussian.json"} and (tmp_path / "notes.txt").exists()

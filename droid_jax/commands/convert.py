@@ -58,7 +58,7 @@ class Convert:
     """The torque contains what carries the arm's weight."""
     torque_constant: tuple[float, ...] = ()
     """N m (N) at the joint that one unit of the logged torque is, for each torque or one for all: of efforts that are
-    amperes or per cent; with --units torque=mA that one A is. A negative one turns the sign."""
+    amperes or per cent; with --units torque=mA (or force=mA) that one A is. A negative one turns the sign."""
     state_topic: str = "/joint_states"
     """Bags: topic of JointState, or of the state of a controller, of a Franka arm or of unitree's motors."""
     command_topic: str | None = None
@@ -184,7 +184,8 @@ def _of_currents(command: Convert) -> bool:
     """Whether --units says that the torques are currents."""
     from droid_jax.recordings.units import CURRENTS
 
-    return _units(command).get("torque") in CURRENTS
+    units = _units(command)
+    return any(units.get(kind) in CURRENTS for kind in ("torque", "force"))
 
 
 def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:

@@ -135,6 +135,12 @@ def _with_other_code(before: Mapping[str, Any]) -> str:
     return f" with other code than it was begun with ({', '.join(other)}; --again starts over)" if other else ""
 
 
+def refuse_own_source(out: Path, fit: Path | None) -> None:
+    """ValueError where a run would start over in the folder that it starts from."""
+    if fit is not None and out.resolve() == fit.resolve():
+        raise ValueError(f"--out {out} holds the fit that this run starts from: choose another --out")
+
+
 def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool = False) -> None:
     """Only now, with all input read, forget an earlier run's results, and say what runs here.
 
@@ -155,7 +161,7 @@ def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool 
 def _of_another_stage(out: Path, stage: str) -> bool:
     """Whether another command's run is in a folder, or one of which nobody knows."""
     with contextlib.suppress(OSError, ValueError):
-        return typed(read_json(out / SETUP), Setup, SETUP).get("command") != stage
+        return typed(read_json(out / SETUP), Setup, SETUP).get("command", "identify") != stage  # which names none
     return any((out / LAST_FILES[other]).exists() for other in LAST_FILES if other != stage)
 
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from droid_jax.commands.folder import begin, fingerprints, finished, setup_of, stage_folder
+from droid_jax.commands.folder import begin, fingerprints, finished, refuse_own_source, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.options import (
     TIMESTEP,
@@ -138,6 +138,7 @@ def run(command: GapCommand) -> None:
 
     out = command.out
     fit = None if command.fit is None else stage_folder(command.fit, "identify", FIT)
+    refuse_own_source(out, fit)
     load_effects(command.user_effects, fit)
     scene, base = gap_model(command)
     given = given_to(command)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands import report
-from droid_jax.commands.folder import RUNS, begin, finished, setup_of
+from droid_jax.commands.folder import RUNS, begin, finished, refuse_own_source, setup_of
 from droid_jax.commands.options import load_effects, warn_of_cpu
 from droid_jax.commands.source import has_model, model_folder, needs_brax, source, synthetic_robot_of
 from droid_jax.commands.writer import writes
@@ -71,6 +71,7 @@ def run(command: Train) -> None:
     from droid_jax.storage import write_bytes, write_json
 
     out, fit = command.out, _fit_folder(command)
+    refuse_own_source(out, fit)
     load_effects(command.user_effects, fit)
     scene, gaussian, effects = source(fit, command.knob)
     gaussian = _chosen(command, gaussian)

@@ -360,4 +360,4 @@ def replay_clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
 
 def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
     """Of one row of a batch of Rollouts -> of all, in one compiled piece."""
-    return jax.jit(jax.vmap(function), compiler_options=runtime.compiler_options())
+    return jax.jit(jax.vmap(runtime.in_full(function)), compiler_options=runtime.compiler_options())

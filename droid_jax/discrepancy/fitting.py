@@ -28,7 +28,6 @@ from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, with_options
-from droid_jax.recordings.clocks import SLACK
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.replay import Drive
 
@@ -315,7 +314,7 @@ def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording
 
 def until(recording: Recording, drive: Drive) -> Recording:
     """What was measured before a replay ends: one of finer steps may go on for a part of a step."""
-    end = float(recording.time[0]) + float(drive.time[-1]) + SLACK
+    end = float(recording.time[0]) + float(drive.time[-1]) + 1e-9  # as `observation.prepared` has it
     channels = {
         name: replace(c, time=c.time[seen], values=c.values[:, seen], mask=c.mask[:, seen])
         for name, c in recording.channels.items()

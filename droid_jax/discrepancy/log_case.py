@@ -341,6 +341,11 @@ def windowed_case(
     if not at_once and not any(why_whole(scene, recording) for recording in train):
         unknown = [e for e in effects if e.over_time]
         effects = [e for e in effects if not e.over_time]
+        if unknown and not effects:
+            raise ValueError(
+                f"windows do not know when their recording began, so {' and '.join(e.name for e in unknown)} cannot be "
+                "looked for in them; --replay whole looks for all"
+            )
     scene, whole = ready(scene), joined(base, effects)
     log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time

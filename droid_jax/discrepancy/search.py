@@ -435,18 +435,19 @@ def converged_model(problem: Problem, model: FittedModel) -> tuple[FittedModel, 
 
 
 def polished(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
-    """The same model with slopes over the width of its posterior: its intervals are reported."""
+    """The same model with slopes over the width of its posterior, whose intervals are reported, if that fit arrives."""
     if not model.parts:
         return model, Notes()
     return _continued(problem, model, problem.case.config.polish, " polished")
 
 
 def _continued(problem: Problem, model: FittedModel, config: RefineConfig, note: str) -> tuple[FittedModel, Notes]:
-    """`model` fitted further; unchanged where the result cannot be replayed on the validation motion."""
+    """`model` fitted further; unchanged, with a note, where the result cannot be replayed on the validation motion, or
+    where `model` had converged and the further fit did not.
+    """
     found = _refit(problem, model.parts, model.values, config, note)
-    if model.refined.converged and not found.refined.converged:
-        return model, Notes()  # it had arrived already
-    if np.isfinite(problem.case.validation.common(found.values)).all():
+    replayed = np.isfinite(problem.case.validation.common(found.values)).all()
+    if replayed and (found.refined.converged or not model.refined.converged):
         return found, Notes()
     return model, Notes(failed=(model.name + note,))
 

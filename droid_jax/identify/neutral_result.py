@@ -224,8 +224,9 @@ def _rows(
         for field, row in native(effect, space, values, model) or {}:
             writes.setdefault((field, (int(row),)), [])
     for joint in scene.held:  # whose friction the fit held, and creeps as the MJCF has it
-        for k in range(2):
-            writes.setdefault(("dof_solimp", (scene.dof(joint), k)), [])
+        for dof in np.flatnonzero(scene.model.dof_jntid == scene.id("joint", joint)).tolist():
+            for k in range(2):
+                writes.setdefault(("dof_solimp", (dof, k)), [])
     for joint in dry:  # `Laws` works on this number, and starts from the fit's each time
         writes.setdefault(("dof_frictionloss", (scene.dof(joint),)), [])
     said = {(c.field, c.entry): (c.attribute, c.index) for c in (made.changes if made else ())}

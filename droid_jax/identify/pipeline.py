@@ -253,7 +253,8 @@ def prepare(
     full = space if nuisances is None or config.refine is None else space + nuisances
     engine = EngineChoice(config.engine, "as asked for")
     if config.engine == "auto":
-        engine = choose_engine(scene, full, [*recordings, *judges], effects, config.search.population)
+        rows = config.search.population * config.search.restarts
+        engine = choose_engine(scene, full, [*recordings, *judges], effects, rows)
     base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
     _check_start(base, full)
     if len(chosen) > 1:

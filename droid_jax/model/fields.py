@@ -76,6 +76,9 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
     return name
 
 
+TURNS = 1  # MjModel.body_simple of a body that may turn; of one that only slides it is 2, and nothing is coupled
+
+
 def _refuse_uncoupled(scene: Scene, p: Parameter, write: Write) -> None:
     """ValueError where C would leave out what a moved centre, or joint, couples.
 
@@ -83,12 +86,13 @@ def _refuse_uncoupled(scene: Scene, p: Parameter, write: Write) -> None:
     """
     model, (first, *_) = scene.model, write.index
     if write.field in ("body_ipos", "body_iquat", PSEUDO_INERTIA):
-        body = first
+        body, coupled = first, model.body_simple[first] == TURNS
     elif write.field in ("jnt_pos", "jnt_axis"):
         body = int(model.jnt_bodyid[first])
+        coupled = model.body_simple[body] != 0
     else:
         return
-    if model.body_simple[body] and model.body_dofnum[body] > 1:
+    if coupled and model.body_dofnum[body] > 1:
         name = model.body(body).name
         raise ValueError(
             f"parameter {p.name!r}: MuJoCo compiles body {name!r} without coupling between its "

@@ -390,7 +390,7 @@ def _hold(spec: mujoco.MjSpec) -> tuple[str, ...]:
     ]
     for joint in soft:
         joint.solimp_friction[:2] = HARD
-    return tuple(joint.name for joint in soft)
+    return tuple(joint.name for joint in soft if joint.name)
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:

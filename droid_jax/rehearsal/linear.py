@@ -146,7 +146,7 @@ class LinearModel:
     blocks how many times the recording's own length, times its blocks.
     minimum: [K] minimum effect size.  low, high: [K] bounds of each coefficient, from neutral on.
     base_low, base_high: [D] by how much the base parameters may move, search units; None: without bounds.
-    margin: [K] how far from its bound a coefficient must end to be named.
+    bound_margin: [K] how far from its bound a coefficient must end to be named.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -160,12 +160,12 @@ class LinearModel:
     high: np.ndarray
     base_low: np.ndarray | None = None
     base_high: np.ndarray | None = None
-    margin: np.ndarray | float = 0.0
+    bound_margin: np.ndarray | float = 0.0
 
     @property
     def largest(self) -> np.ndarray:
         """[K] largest size of a coefficient that is named: upwards, or downwards where neutral is the upper bound."""
-        return np.where(self.high > 0, self.high, -self.low) - self.margin
+        return np.where(self.high > 0, self.high, -self.low) - self.bound_margin
 
     @property
     def sign(self) -> np.ndarray:
@@ -187,10 +187,10 @@ class LinearModel:
         train = replace(self.train, raw=self.train.raw[some])
         directions = tuple(self.directions[k] for k in some)
         minimum, low, high = (a[some] for a in (self.minimum, self.low, self.high))
-        margin = np.broadcast_to(self.margin, self.low.shape)[some]
+        margin = np.broadcast_to(self.bound_margin, self.low.shape)[some]
         return replace(
             self, directions=directions, train=train, validation=train, minimum=minimum, low=low, high=high,
-            margin=margin,
+            bound_margin=margin,
         )  # fmt: skip
 
     @property

@@ -322,7 +322,7 @@ def linear_model(
         high=np.array([p.high - p.mean for p in of]),
         base_low=low[refined.free],
         base_high=high[refined.free],
-        margin=np.array([0.0 if p.name in case.natural_bounds else share * (p.high - p.low) for p in of]),
+        bound_margin=np.array([0.0 if p.name in case.natural_bounds else share * (p.high - p.low) for p in of]),
     )
 
 

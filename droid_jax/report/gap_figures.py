@@ -79,7 +79,7 @@ def _pairs(
     """Bars side by side, their numbers above them; a value at or below zero has its number at the bottom."""
     table = as_floats(values)[: 2 if extended else 1]
     least = np.min(table[table > 0], initial=np.inf)
-    tiny = error is not None and error < TINY * least
+    tiny = error is not None and np.isfinite(least) and error < TINY * least
     scale(axes, table.ravel().tolist() + ([] if error is None or tiny else [error]))
     step, size = (0.4, 0.36) if extended else (0.0, 0.5)
     for i, (row, name, colour) in enumerate(zip(table, MODELS, (BEFORE, AFTER), strict=False)):
@@ -97,7 +97,8 @@ def _pairs(
                 fontsize=7.5,
             )
     if error is not None:
-        text = f"discretisation error {significant(error)}" + (" (below the axis)" if tiny else "")
+        below = error < axes.get_ylim()[0]
+        text = f"discretisation error {significant(error)}" + (" (below the axis)" if below else "")
         axes.axhline(error, color=MEASURED, linestyle=(0, (3, 2)), linewidth=1.1, label=text)
     axes.set_xticks(range(len(names)), names)
     axes.set_xlim(-0.6, len(names) - 0.4)

@@ -67,12 +67,13 @@ def over_block(function: Callable[..., Any], alike: bool = True) -> Callable[...
     rows = PartitionSpec(AXIS)
 
     def block(values: jax.Array, more: tuple[Any, ...]) -> Any:
-        with jax.default_matmul_precision(runtime.PRODUCTS):  # also for a caller without `runtime.tune`
-            return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
+        return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
 
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
     specs = rows, PartitionSpec() if alike else rows
-    mapped = jax.shard_map(block, mesh=runtime.devices_mesh(), in_specs=specs, out_specs=rows, check_vma=False)
+    mapped = jax.shard_map(
+        runtime.in_full(block), mesh=runtime.devices_mesh(), in_specs=specs, out_specs=rows, check_vma=False
+    )
     compiled = jax.jit(mapped, compiler_options=runtime.compiler_options())
     return lambda values, *more: compiled(jnp.asarray(values, jnp.float32), more)
 

@@ -259,7 +259,7 @@ def _inverse_program(
         return along(make_physics(scene, space, values), path)
 
     torques = jax.jit(
-        jax.vmap(lambda values, path: replay(values, path).torque, in_axes=(None, 0)),
+        jax.vmap(runtime.in_full(lambda values, path: replay(values, path).torque), in_axes=(None, 0)),
         compiler_options=runtime.compiler_options(),
     )
     return over_block(_of_bodies(scene, space, replay)), torques

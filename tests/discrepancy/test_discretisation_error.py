@@ -106,3 +106,20 @@ def test_the_score_test_takes_off_what_the_time_step_does(found: Small):
     assert halved.size == pytest.approx(0.5 * plain.size, rel=0.1, abs=1e-3)
     whole = score_test(replace(found.case.train, step_difference=common), base, asked)
     assert whole.p > 0.1 and np.abs(whole.size).max() < 0.1 * np.abs(plain.size).max()
+
+
+def test_a_finer_step_is_compared_with_what_the_coarse_one_reached(found: Small):
+    """Not with samples that were taken behind its last step."""
+    cost = found.case.train.cost
+    recording = found.recordings["train"]
+    end = float(recording.time[0]) + float(cost.drives[0].time[-1])
+    late = {
+        name: replace(c, time=np.r_[c.time[c.time <= end], end + 5e-4],
+                      values=np.concatenate([c.values[:, c.time <= end], c.values[:, -1:]], axis=1),
+                      mask=np.concatenate([c.mask[:, c.time <= end], c.mask[:, -1:]], axis=1))
+        for name, c in recording.channels.items()
+    }  # fmt: skip
+    kept = fitting.until(replace(recording, channels=late), cost.drives[0])
+    for name, channel in kept.channels.items():
+        assert channel.time[-1] <= end + 1e-9 < late[name].time[-1]
+        assert channel.values.shape[1] == channel.mask.shape[1] == len(channel.time) == len(late[name].time) - 1

@@ -473,6 +473,6 @@ def test_an_effect_at_its_bound_is_not_found():
     (plain,) = smallest_sizes(of_repeats(), [1], CONFIG)
     high = np.full(DIRECTIONS, 1.01 * plain.size)
     (inside,), (beyond,) = (
-        smallest_sizes(of_repeats(high=high, margin=margin), [1], CONFIG) for margin in (0.0, 0.02 * high)
+        smallest_sizes(of_repeats(high=high, bound_margin=margin), [1], CONFIG) for margin in (0.0, 0.02 * high)
     )
     assert np.isfinite(inside.size) and not np.isfinite(beyond.size)
