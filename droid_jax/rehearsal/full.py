@@ -252,10 +252,10 @@ def _rehearse(of: FullRehearsal, case: HiddenCase, replays: Path) -> dict[str, A
 def judged_parameters(of: FullRehearsal, logs: Sequence[Recording], values: np.ndarray) -> list[dict[str, Any]]:
     """Of every parameter of interest: whether an identification recovers it, and whether its interval holds."""
     main = of.space.select([p.name for p in of.space.parameters if not p.nuisance])
-    nuisances = of.space.select([p.name for p in of.space.parameters if p.nuisance])
+    names = [p.name for p in of.space.parameters if p.nuisance]
     config = replace(of.identify, channels=of.channels)
     found = identify_parameters(
-        of.scene, main, list(logs[:1]), nuisances=nuisances if len(nuisances) else None, config=config
+        of.scene, main, list(logs[:1]), nuisances=of.space.select(names) if names else None, config=config
     )
     low, high = found.full_gaussian.interval(LEVEL)
     verdicts = {t.name: t for t in found.identifiability}
