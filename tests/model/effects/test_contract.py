@@ -325,8 +325,12 @@ def test_neutral_is_the_door_without_effects(real: Bench):
     check_neutral(real, base)
 
 
+# Its arm has no friction of its own that could be soft, and its slow motions reach no limit of a servo's goal.
+NOT_ON_THE_DOOR = ("soft_friction", "profile_acceleration", "profile_speed")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in EFFECTS if n != "soft_friction"])  # its arm has no friction of its own
+@pytest.mark.parametrize("name", [n for n in EFFECTS if n not in NOT_ON_THE_DOOR])
 def test_on_the_door(real: Bench, name: str):
     # A only opens the door, which says nothing of a closer; C closes it again.
     bench = door_bench(names=[name], motion="C") if name == "door_closer" else real
