@@ -10,6 +10,7 @@ import pytest
 from effect_bench import Bench
 from effect_oracles import ORACLES
 
+from droid_jax.identify.fit import with_acting
 from droid_jax.identify.multistart import RefineConfig, refine
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
@@ -39,6 +40,8 @@ def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
         return ((bench.run(whole).torque - measured) / NOISE).reshape(len(values), -1)
 
     start = starts(bench.effect(name), free)
+    # As `identify` does: an effect of one sign that reaches no limit at first has no slope there.
+    start = np.stack([*start, *with_acting(free, start[0], [*truth])])
     true = np.array(list(truth.values()))
     assert (start != true).all() and (np.mean(residuals(start) ** 2, axis=1) > 2.0).all()
     fit = refine(residuals, free, start, RefineConfig(basin_hops=0))
