@@ -264,7 +264,11 @@ def test_firm_friction_of_many_joints_is_that_of_the_c_engine(joints: int):
 
 @pytest.mark.slow
 def test_a_light_arm_that_steps_and_holds_goes_where_c_goes():
-    """Five joints, 6 s of steps, against C at an eighth of the step."""
+    """Five joints, 6 s of steps, against C at an eighth of the step, where it holds.
+
+    Velocities stand half a step before positions, so a command that jumps acts half a step early: 8 mrad while the arm
+    is on its way.  A replay makes up for that (`late` of `servo_replay`), a step by itself does not.
+    """
     goals = 0.5 * np.random.default_rng(1).uniform(-1, 1, (4, 5))
 
     def goal(time: float) -> np.ndarray:
@@ -283,8 +287,10 @@ def test_a_light_arm_that_steps_and_holds_goes_where_c_goes():
         return simulate_step(coarse, data.replace(ctrl=ctrl), parity=False), data.qpos
 
     got = jax.jit(lambda d: jax.lax.scan(advance, d, table)[1])(mjx.make_data(coarse))
+    holds = np.arange(1500) * 0.004 % 1.5 > 1.0  # s after a step
     off = np.abs(np.asarray(got) - np.array(expected))
-    assert off.max() < 3e-4, off.max(axis=0)
+    assert off[holds].max() < 3e-4, off[holds].max(axis=0)
+    assert off.max() < 1e-2
     assert np.ptp(expected, axis=0).min() > 0.1
 
 
