@@ -229,7 +229,7 @@ def as_a_whole(
 ) -> Piece:
     """A repeat from its beginning, without instants that were not measured.
 
-    steps: as long as it is replayed.  grid: s, the time step whose last instant is the last one compared; None: its
+    steps: how many are replayed.  grid: s, the time step whose last instant is the last one compared; None: its
     own.  windows: `lead` of the beginning is not compared; `reach` tells how far the start may be off, but not where an
     object is gripped, whose contacts change with it.
     """

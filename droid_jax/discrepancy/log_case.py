@@ -337,15 +337,16 @@ def windowed_case(
         config = replace(
             config, **{name: replace(getattr(config, name), **FEWER_TRIALS) for name in ("refine", "refit", "polish")}
         )
-    unknown = list[Effect]()
+    unknown = list[str]()
     if not at_once and not any(why_whole(scene, recording) for recording in train):
-        unknown = [e for e in effects if e.over_time]
+        unknown = [e.name for e in effects if e.over_time]
         effects = [e for e in effects if not e.over_time]
-        if unknown and not effects:
-            raise ValueError(
-                f"windows do not know when their recording began, so {' and '.join(e.name for e in unknown)} cannot be "
-                "looked for in them; --replay whole looks for all"
-            )
+    left_out = (
+        f"Windows do not know when their recording began, so {' and '.join(unknown)} cannot be looked for in them "
+        "(--replay whole looks for all)."
+    )
+    if unknown and not effects:
+        raise ValueError(left_out)
     scene, whole = ready(scene), joined(base, effects)
     log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
     log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
@@ -374,10 +375,7 @@ def windowed_case(
     last = sets[2] if len(sets) > PARTS else None
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
     if unknown:
-        limits.append(
-            f"Windows do not know when their recording began, so {' and '.join(e.name for e in unknown)} cannot be "
-            "looked for in them (--replay whole looks for all)."
-        )
+        limits.append(left_out)
     if sampled and not log.whole:
         limits.insert(
             0,

@@ -156,9 +156,14 @@ def _explained(problem: Problem, model: FittedModel) -> bool:
     if not asked:
         return True
     problem.progress("score_test", model.name)
-    found = score_test(case.train, model, asked, case.config.seed)
-    significant = found.p < case.config.selection.significance
-    return not (significant and more_than_step_error(case, model, found, problem.discretisation_error))
+    return _nothing_more(problem, model, score_test(case.train, model, asked, case.config.seed))
+
+
+def _nothing_more(problem: Problem, model: FittedModel, found: ScoreTest) -> bool:
+    """Whether a score test of a model finds nothing, or no more than the time step leaves."""
+    if found.p >= problem.case.config.selection.significance:
+        return True
+    return not more_than_step_error(problem.case, model, found, problem.discretisation_error)
 
 
 def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, SelectionStep | None]:
@@ -172,8 +177,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     problem.progress("score_test", model.name)
     found = score_test(case.train, model, asked, case.config.seed)
     thresholds = case.config.selection
-    exhausted = found.p >= thresholds.significance
-    exhausted = exhausted or not more_than_step_error(case, model, found, problem.discretisation_error)
+    exhausted = _nothing_more(problem, model, found)
     info, notes = SelectionStep(found), Notes()
     enough = not model.parts or problem.discrepancy(model) > thresholds.least_share * problem.base_discrepancy
     if enough and not exhausted:
@@ -446,10 +450,11 @@ def _continued(problem: Problem, model: FittedModel, config: RefineConfig, note:
     where `model` had converged and the further fit did not.
     """
     found = _refit(problem, model.parts, model.values, config, note)
-    replayed = np.isfinite(problem.case.validation.common(found.values)).all()
-    if replayed and (found.refined.converged or not model.refined.converged):
-        return found, Notes()
-    return model, Notes(failed=(model.name + note,))
+    if not np.isfinite(problem.case.validation.common(found.values)).all():
+        return model, Notes(failed=(model.name + note,))
+    if model.refined.converged and not found.refined.converged:
+        return model, Notes(not_tried=(f"{model.name}{note} to the end",))  # that its replay blew up would be false
+    return found, Notes()
 
 
 def _decided(

@@ -461,3 +461,25 @@ def test_a_model_that_was_selected_has_converged(found: Small, first: tuple[Sear
     state, _ = first
     model: FittedModel = state.model
     assert model.refined.converged
+
+
+def test_a_further_fit_that_does_not_arrive_leaves_the_converged_model(monkeypatch: pytest.MonkeyPatch):
+    """And is not said to have blown up; one that does arrive, or begins at an unfinished model, is taken."""
+
+    def model(converged: bool, value: float = 1.0) -> Any:
+        return SimpleNamespace(
+            name="a", parts=("drag",), values=np.array([value]), refined=SimpleNamespace(converged=converged)
+        )
+
+    validation = SimpleNamespace(common=lambda values: values)
+    problem: Any = SimpleNamespace(case=SimpleNamespace(validation=validation, config=DiscrepancyConfig()))
+    for before, after, taken, notes in (
+        (True, model(True, 2.0), True, Notes()),
+        (False, model(False, 2.0), True, Notes()),
+        (True, model(False, 2.0), False, Notes(not_tried=("a polished to the end",))),
+        (True, model(True, np.nan), False, Notes(failed=("a polished",))),
+    ):
+        monkeypatch.setattr(search, "_refit", lambda *_, after=after: after)
+        begun = model(before)
+        found, said = search.polished(problem, begun)
+        assert found is (after if taken else begun) and said == notes
