@@ -4,8 +4,8 @@
 
 Starts `python -m droid_jax.run` without options but its folder, in a process of its own and with an empty compilation
 cache, and keeps what it prints with the time of every line.  With --against the same command of another commit runs
-before it, and this one's once more after it, with what it has compiled.  Writes DIR/default_run.json; the run's folder,
-with the page, is left in DIR/default_run.
+after it, and then this one's once more, with what it has compiled.  Writes DIR/default_run.json, first as soon as one
+run has ended; the run's folder, with the page, is left in DIR/default_run.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Arguments:
     quick: bool = False
     """Stop the command where its first stage begins: shows that it starts, and how fast."""
     against: Path | None = None
-    """Checkout of another commit whose default command is timed first (git worktree add --detach CHECKOUT COMMIT)."""
+    """Checkout of another commit whose default command is timed too (git worktree add --detach CHECKOUT COMMIT)."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of default_run.json."""
 
@@ -146,16 +146,16 @@ def main() -> None:
     arguments = tyro.cli(Arguments, description=__doc__)
     name, quick = stem("default_run", arguments.quick), arguments.quick
     out, other = arguments.out / name, arguments.against
-    written, paired = arguments.out / f"{name}.json", dict[str, Any]()
-    if other is not None:
-        paired["against"] = of_another_commit(other, out, quick)
-        write_json(written, paired)  # each run takes half an hour or more: what is there stays
+    written = arguments.out / f"{name}.json"
     with tempfile.TemporaryDirectory() as cache:
         lines = shown(command_lines(out, cache), quick)
         found: dict[str, Any] = {"help_s": help_seconds(), **figures(lines), **({} if quick else results(out))}
         found["printed"] = [[round(line.seconds, 1), line.text] for line in lines]
-        write_json(written, found | paired | ratios(found, paired))
+        paired = dict[str, Any]()
+        write_json(written, found)  # each run takes half an hour or more: what is there stays
         if other is not None:
+            paired["against"] = of_another_commit(other, out, quick)
+            write_json(written, found | paired | ratios(found, paired))
             with tempfile.TemporaryDirectory() as folder:
                 paired["warm"] = figures(shown(command_lines(Path(folder) / name, cache), quick))
     import tuned  # noqa: F401  (before jax starts: the run had all cores)
