@@ -218,8 +218,12 @@ def headline(rows: Sequence[Row], untuned: dict[str, Any] | None, memory: dict[s
     """The numbers of the last line: this program's own blocks against C, at 256 samples where measured."""
     measured = [row.population for row in rows if row.engine == OWN]
     population = HEADLINE if HEADLINE in measured else max(measured)
-    # C is measured once more beside mjx.step: the first row of a name is the replay's partner.
-    at = {row.engine: row for row in reversed(rows) if row.population == population}
+
+    def beside(population: int) -> dict[str, Row]:
+        # C is measured once more beside mjx.step: the first row of a name is the replay's partner.
+        return {row.engine: row for row in reversed(rows) if row.population == population}
+
+    at, few = beside(population), beside(BARE_POPULATION)
     bare = {row.engine: row.rate for row in rows}
     return {
         "population": population,
@@ -227,6 +231,7 @@ def headline(rows: Sequence[Row], untuned: dict[str, Any] | None, memory: dict[s
         "mjx_one_block_steps_per_s": at[WHOLE].rate,
         "c_steps_per_s": at[C].rate,
         "ratio_to_c": at[OWN].rate / at[C].rate,
+        "ratio_to_c_32": few[OWN].rate / few[C].rate if OWN in few else None,
         "mjx_step_option_steps_per_s": bare[OPTION],
         "mjx_step_all_devices_steps_per_s": bare[SHARDED],
         "untuned_steps_per_s": Row(**untuned).rate if untuned and "error" not in untuned else None,

@@ -1,6 +1,6 @@
 """A function of one parameter vector, made into a compiled batch over all devices; a loop that is cheap to batch.
 
-Rows are processed in blocks of one fixed size, so that a program compiles once however many rows
+Rows are processed in blocks of one fixed size (on a CPU one of two), so that a program compiles once however many rows
 a stage asks for.  A block is split over the devices with shard_map; only what is wrapped here is
 sharded, search and statistics stay on one device.  In a run of several processes each does its share of the rows
 (`distributed`).
@@ -27,6 +27,7 @@ from droid_jax import distributed, runtime
 AXIS = "population"
 CPU_BLOCK = 32  # rows; on a CPU blocks of 64 to 512 run 12 to 25 % faster, and every smaller stage would pay for them
 MANY_BLOCK = 128  # rows, where batches always have many: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
+LARGE_BLOCK = 256  # rows, where a whole number of such blocks is asked for, as users choose populations: a fifth faster
 GPU_BLOCK = 4096  # rows at most in one piece on an accelerator
 
 
@@ -44,12 +45,15 @@ def block_size(rows: int, many: bool = False) -> int:
 def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
     """Cut [P, D] into (block [B, D], rows that count); the last block repeats its last row.
 
+    On a CPU blocks have LARGE_BLOCK rows where that fills them all: two programs then serve every number of rows.
+
     Raises ValueError for an array that is not [P, D] with P >= 1.
     """
     values = np.asarray(values)
     if values.ndim != 2 or len(values) == 0:
         raise ValueError(f"expected parameter vectors [P, D] with P >= 1, got shape {values.shape}")
-    size = block_size(len(values))
+    exact = jax.default_backend() == "cpu" and len(values) % LARGE_BLOCK == 0
+    size = LARGE_BLOCK if exact and LARGE_BLOCK % runtime.devices_mesh().size == 0 else block_size(len(values))
     for start in range(0, len(values), size):
         block = values[start : start + size]
         # Repeating a row keeps the padding inside the valid range.
