@@ -28,6 +28,8 @@ RENAMED = {
     r"\bgone_on_with\b|\bplainest\b|\bwithout_idle\b|\bfitted_anew\b": "polished, simplest, without_dominated, ...",
     r"\bhops=|\bhop_generations=(?<!basin_hop_generations=)|\brough=(?!rough)": "basin_hops, coarse tolerance",
     r"(?<!data-)\bdoubt=(?!0\.6)": "misfit_threshold",  # but of the page's attribute and of the models' comparison
+    r"\ba\.(amplitude|places)\(|\bshape_told\b|\btold_start\b": "coefficient, locations, shape_interval_share, ...",
+    r"\bgeoms_among_looks\b|\blook_geoms\b|\bwithout_looks\b": "full_geom_ids, visual_geoms, without_visual_geoms",
     r"of one's own|worth a name\b|does as well\b": "your own, minimum effect size, equivalent",
 }
 ENDINGS = (".py", ".md", ".jinja", ".ipynb", ".toml", ".css")
@@ -53,6 +55,26 @@ def test_no_old_word_comes_back(old: str) -> None:
 
 def test_the_search_for_old_words_finds_one() -> None:
     assert len(texts()) > 300 and any(re.search(old, "a stand-in for Evidence") for old in RENAMED)
+
+
+# What docstrings name with a dot that is no module of the package: values, files and other libraries.
+OTHERS = re.compile(r"(found|motion|config|data|env|sys|time|jax|torch|droid_jax)\.|\w+\.py$")
+
+
+def test_modules_that_docstrings_name_are_there() -> None:
+    root, unknown = ROOT / "droid_jax", list[str]()
+    named = {
+        (path, match[1])
+        for path in root.rglob("*.py")
+        for match in re.finditer(r"`([a-z_]+\.[A-Za-z_]+)(?:\.[A-Za-z_]+)*`", path.read_text())
+    }
+    for path, name in sorted(named):
+        first, second = name.split(".")
+        of_package = [*root.rglob(f"{first}/{second}.py")]
+        holds = [p for p in root.rglob(f"{first}.py") if re.search(rf"\b{second}\b", p.read_text())]
+        if not (of_package or holds or OTHERS.match(name)):
+            unknown.append(f"{path.relative_to(ROOT)}: {name}")
+    assert len(named) > 50 and unknown == []
 
 
 def test_the_files_that_contributing_names_are_there() -> None:

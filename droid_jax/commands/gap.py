@@ -82,14 +82,14 @@ class GapCommand:
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
-    """Joint of the thing that is moved, in your own scene; without it no effect of a door is asked about."""
+    """Joint of the thing that is moved, in your own scene; without it no effect of a door is tested."""
     joint_friction: JointFriction = "held"
     """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
     solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effects: tuple[str, ...] = ()
-    """Effects of the library to ask about; default: all that the scene can have."""
+    """Effects of the library to test; default: all that the scene can have."""
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
     effect_scale: float = 1.0
@@ -278,7 +278,7 @@ def chosen_effects(
     left = tuple(e for e in here if e.name in asked and e.name not in command.without)
     nowhere = [e.name for e in left if not e.locations]
     if nowhere:
-        what = f"effects {', '.join(nowhere)} state no locations (Effect.locations), where they could be asked about"
+        what = f"effects {', '.join(nowhere)} state no locations (Effect.locations), where they could be tested"
         if {*nowhere} & {*command.effects}:
             raise ValueError(what)
         warnings.warn(f"{what}: they are left out", stacklevel=2)

@@ -149,7 +149,7 @@ _SIGNS = {
     ASKED: ("preset", "seed", "effect_scale", "files"),
     CONFIG: ("preset", "recordings", "synthetic_robot"),
     FIT: ("parameters",),
-    GAP: ("verdict", "gaps"),
+    GAP: ("verdict", "discrepancies"),
     TRAINING: ("setup", "history"),
 }
 _SYNTHETIC = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordings of the synthetic robot

@@ -143,7 +143,7 @@ class Cost:
         return assemble(self.scene, self.space, made, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
-        """Repeats of a recording as if all had started where its replay does (`own_starts.from_one_start`)."""
+        """Repeats of a recording as if all had started where its replay does (`repeat_starts.from_one_start`)."""
         config = self.comparisons[index].config.start
         own = own_starts(recording, config)
         return _from_one_start(self.scene, self.space, own, self.drives[index], self._replays[index], config)

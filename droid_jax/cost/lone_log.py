@@ -114,8 +114,8 @@ def lone_log(
             replay needs repeats.
     """
     if recording.repeats > 1:
-        raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats: use make_case")
+        raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats, and a log in blocks has one")
     cost = make_cost(scene, space, [recording], config=config, effects=effects, check=False)
     if not isinstance(cost.drives[0], Motion):
-        raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs in inverse mode")
+        raise ValueError(f"recording {recording.name!r} holds commands; blocks are for logs without")
     return LoneLog(**{f.name: getattr(cost, f.name) for f in fields(cost)})

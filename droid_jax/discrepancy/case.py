@@ -207,7 +207,7 @@ FAR = 1e4  # prior deviations that no sensor is off
 @dataclass(frozen=True, eq=False)
 class Case:
     """What every step needs.  train: parameters are fitted to it; validation: effects are selected on it; test: opened
-    once, at the end.  base: the base parameters; effects: those that are asked about.
+    once, at the end.  base: the base parameters; effects: those that are tested.
     start: [D] from where the base fit of a log begins, None: the prior's mean.  limits: what cannot be concluded from
     these recordings, beside `Split.limits`.
     """
@@ -278,7 +278,7 @@ def make_case(
     Args:
         scene: the robot.
         base: all that is fitted without any effect.
-        effects: to ask about.
+        effects: to test.
         train: parameters are fitted to it.
         validation: moves differently; effects are selected on it.
         test: judged on once, when the effects are selected; `minimum_closed` may then turn names into hints.

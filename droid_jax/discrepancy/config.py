@@ -60,7 +60,7 @@ class SelectionConfig:
             for its effects to be named beside an unexplained remainder; with less they are hints.  0.4 turned 9 false
             names and one right one of the blind run d1a4e04 into hints.
         mostly_explained: share explained below which the sentence says that most of it is not in the library.
-        shape_told: share of a shape parameter's range; where its interval is wider, a bound says nothing of the form.
+        shape_interval_share: of a shape parameter's range; where its interval is wider, its bound says nothing.
         false_discovery_rate: of the cells of the residual maps (Benjamini and Hochberg).
     """
 
@@ -85,7 +85,7 @@ class SelectionConfig:
     open_share: float = 0.1
     minimum_closed: float = 0.4
     mostly_explained: float = 0.5
-    shape_told: float = 0.5
+    shape_interval_share: float = 0.5
     false_discovery_rate: float = 0.1
 
     def __post_init__(self) -> None:

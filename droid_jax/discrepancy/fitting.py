@@ -301,7 +301,7 @@ def intervals(
 
 
 def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
-    """The cost of the base model at a quarter of the time step; None in inverse mode, which has no time step."""
+    """The cost of the base model at a quarter of the time step; None without commands, which has no time step."""
     cost = residual_set.cost
     if not isinstance(cost.drives[0], Drive):
         return None

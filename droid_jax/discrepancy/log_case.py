@@ -282,7 +282,7 @@ def case_of(
 
     start: [F] values of the base parameters out of an earlier fit, where those of commanded logs in blocks begin.
     progress: called with each iteration of the first fits of commanded logs, which tell the noise.
-    Sensors' gains and encoders' offsets that the base has as parameters are not asked about there.
+    Sensors' gains and encoders' offsets that the base has as parameters are not tested there.
     Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
     """
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
@@ -314,7 +314,7 @@ def windowed_case(
     Args:
         scene: the robot.
         base: all that is fitted without any effect.
-        effects: to ask about.
+        effects: to test.
         train: commanded recordings of the same channels, of one repeat or several.  Of long ones that would be replayed
             whole a number of windows is (`WindowConfig.longest`).
         test: others.

@@ -76,7 +76,7 @@ def find_missing_effects(
         recordings: train, validation and perhaps test, eight repeats or more of each; or one, sixteen repeats or more,
             whose second half validates; or a log of one repeat without commands, alone or with another one as test
             data; or any number of commanded logs with fewer repeats, whose windows train and validate in turns.
-        effects: to ask about; None for all of the library (`droid_jax.model.effects.registry`) that could show in
+        effects: to test; None for all of the library (`droid_jax.model.effects.registry`) that could show in
             these recordings.
         start: [D] physical values over `space`, `found.best`, where the base fit begins instead of with a search; a
             log without repeats needs neither.
@@ -101,7 +101,7 @@ def find_missing_effects(
     compared = comparing(scene, recordings, config).compare.channels
     asked = observable_effects(scene, recordings, channels=compared) if given is None else tuple(map(checked, given))
     if not asked:
-        raise ValueError("effects: there is none to ask about; None asks about all of the library")
+        raise ValueError("effects: there is none to test; None tests all of the library")
     candidates(asked)  # refused before the base fit, and not after it
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config, start)

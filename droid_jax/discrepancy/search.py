@@ -59,7 +59,7 @@ class Problem:
     """What every step is given.
 
     case: the recordings; base: the base model; base_discrepancy: its U on the validation recording;
-    discretisation_error: U0; directions: all that is asked about; deadline: `time.monotonic` after which no further
+    discretisation_error: U0; directions: all that are tested; deadline: `time.monotonic` after which no further
     candidate is tried; progress: called with a stage's name and value.
     """
 
@@ -119,7 +119,7 @@ def search_effects(
         progress: called with a stage's name and value.
 
     Raises:
-        ValueError: the case's effects have no location that could be asked about.
+        ValueError: the case's effects have no location that could be tested.
     """
     minutes, before = case.config.budget_minutes, case.validation.discrepancy_at(base.values)
     deadline = None if minutes is None else time.monotonic() + 60 * minutes

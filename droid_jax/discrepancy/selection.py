@@ -414,6 +414,6 @@ def doubts(train: ResidualSet, model: FittedModel, natural_bounds: Collection[st
 def _misfit(train: ResidualSet, model: FittedModel, name: str) -> str:
     p, side = train.cost.space[name], bound_at(train, model, name)
     low, high = intervals(train, model, [name])[name]
-    if not side or high - low > train.config.shape_told * (p.high - p.low):
+    if not side or high - low > train.config.shape_interval_share * (p.high - p.low):
         return ""
     return f"{name} at its {side} bound, {with_unit(p.low if side == 'lower' else p.high, p)}"

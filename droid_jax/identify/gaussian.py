@@ -7,7 +7,7 @@ judged: the one CMA-ES ends with shrinks with every generation and is no posteri
 
 Bounds.  Draws of a linearly scaled parameter (and of every parameter in physical coordinates) that
 fall outside the bounds are drawn again, whole rows at a time, as the paper redraws negative values; where
-hardly any row falls inside, Gibbs sampling draws from the same distribution (`identify.truncated`).
+hardly any row falls inside, Gibbs sampling draws from the same distribution (`identify.truncated_normal`).
 A log-scaled parameter in search coordinates is clipped by its map instead, so that a bound of
 exactly zero keeps the probability that lies beyond it.
 

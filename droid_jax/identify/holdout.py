@@ -25,8 +25,9 @@ Judged = Literal["repeats", "time", "same", "recordings"]
 class HeldoutDistance:
     """Disagreement with what was held out of one recording, before and after the fit.
 
-    channels: what was compared; per-joint numbers are of the first one.  unit: of the distances, that of the channel,
-    or "noise units" where several are compared (`channels.in_noise_units`).
+    channels: what was compared; per-joint numbers are of the leading one (torque, where it is compared).
+    unit: of the distances, that of the channel, or "noise units" where several are compared (see
+    `channels.in_noise_units`).
     before, after, noise_floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
     model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
     closed: share of the way from before to noise_floor; None where before does not exceed it by the share

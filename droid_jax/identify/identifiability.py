@@ -97,7 +97,7 @@ def posterior_of(
 ) -> Gaussian:
     """What the recordings that were refined on tell by themselves, but for the refinement's wide prior.
 
-    For questions to the data alone, as whether an amplitude may be zero.
+    For questions to the data alone, as whether a coefficient may be zero.
     misfit: whether what the model leaves over beyond noise widens it too; without it the model is taken to be right.
     """
     channels = [c for comparison in comparisons for c in comparison.channels]

@@ -287,7 +287,7 @@ def _row(
     return {
         "element": element,
         "name": getattr(model, element)(number).name,
-        "id": int(scene.geoms_among_looks[number]) if element == "geom" else int(number),
+        "id": int(scene.full_geom_ids[number]) if element == "geom" else int(number),
         "attribute": attribute,
         "index": place,
         "unit": field_unit(field, bool(slides)),

@@ -159,7 +159,7 @@ _FIELDS = tuple(Rollout.__dataclass_fields__)
 class Preparation:
     """What is to be identified, checked: costs over `full`, which is `space` with the nuisances that are fitted.
 
-    heldout_count: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.
+    heldout_recordings: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.
     judges: whole recordings that judge instead; then no repeat is held out.  fit, heldout: costs on what is fitted and
     on what judges.
     early: as fit, of the beginnings of long recordings.  seconds: that this took.  engine: that replays.
@@ -171,7 +171,7 @@ class Preparation:
     config: IdentifyConfig
     effects: tuple[Effect, ...]
     recordings: tuple[Recording, ...]
-    heldout_count: tuple[Recording, ...]
+    heldout_recordings: tuple[Recording, ...]
     heldout_repeats: tuple[tuple[int, ...], ...]
     judges: tuple[Recording, ...]
     fit: Cost
@@ -284,7 +284,7 @@ def prepare(
         config=config,
         effects=tuple(effects),
         recordings=tuple(recordings),
-        heldout_count=held,
+        heldout_recordings=held,
         heldout_repeats=numbers,
         judges=judges,
         fit=base,
@@ -330,7 +330,9 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     began = time.monotonic()
     report("judge", None)
     judges, apart = problem.judges or problem.recordings, bool(problem.judges)
-    gaps = heldout_distances(problem.heldout, judges, problem.heldout_count, full.mean, best, config.worth, apart)
+    distances = heldout_distances(
+        problem.heldout, judges, problem.heldout_recordings, full.mean, best, config.worth, apart
+    )
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
@@ -356,7 +358,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         identifiability=(
             not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, judging)
         ),
-        heldout_distances=dict(zip((r.name for r in judges), gaps, strict=True)),
+        heldout_distances=dict(zip((r.name for r in judges), distances, strict=True)),
         fit=base,
         heldout=problem.heldout,
         heldout_repeats=dict(zip(names, problem.heldout_repeats, strict=True)),

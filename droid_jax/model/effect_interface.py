@@ -75,7 +75,7 @@ class Effect:
                   at which a replay is as without it.
     profile:      (theta, command [T, U], s between its rows) -> [T, U], what a servo makes of the whole command, before
                   any law of `command`.
-    profile_limits: "acceleration" or "speed" where `profile` limits that of a joint's goal to one over its amplitude,
+    profile_limits: "acceleration" or "speed" where `profile` limits that of a joint's goal to one over its coefficient,
                   so that programs without this one can; empty for another path.
     command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
     servo:        (theta, State, ctrl [U]) -> [U], what the servo is given in place of the command.
@@ -85,17 +85,17 @@ class Effect:
     native:       (values by name, MjModel with the fitted values) -> (field, row) -> what to add there: the same law
                   in MuJoCo's own numbers, for the MJCF; None where this model has none.
 
-    For the gap search:
-    description, signature:   a sentence each: what it is, and where its mark should appear.
+    For the search for missing effects:
+    description, signature:   a sentence each: what it is, and where it should show.
     confused_with: names of effects that look alike on some data.
     remedy: what to do, where the simulator is at fault and nothing on the robot.
     special_cases:        names of effects that are special cases of it, or nearly so over the range of a motion:
                   where one of them is equivalent, this one is dominated.
-    locations:       place -> the amplitudes there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
+    locations:       place -> the coefficients there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
                   them the effect is of no interest to the search.  A place may hold other places ("all joints").
-    shape_parameters:       parameters that matter only beside an amplitude, and the values to try.
-    minimum_size:     amplitude below which it is not named, in its own unit.
-    natural_bounds:         amplitudes whose bounds are where nature ends (friction that is wholly firm): a fit may
+    shape_parameters:       parameters that matter only beside a coefficient, and the values to try.
+    minimum_size:     coefficient below which it is not named, in its own unit.
+    natural_bounds:         coefficients whose bounds are where nature ends (friction that is wholly firm): a fit may
     stand there.
     over_time: its law goes by the time since the recording began, of which a window out of it knows nothing.
     """

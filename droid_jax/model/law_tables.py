@@ -77,10 +77,10 @@ def law_tables(
         spread: deviation by parameter, of those that vary: tables hold shapes up to four of them away.
     """
     for effect in effects:
-        for location, amplitudes in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
-            if not any(values[name] or spread.get(name) for name in amplitudes if name in values):
+        for location, coefficients in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
+            if not any(values[name] or spread.get(name) for name in coefficients if name in values):
                 continue
-            law = _Law(scene, model, effect, location, amplitudes, values, spread)
+            law = _Law(scene, model, effect, location, coefficients, values, spread)
             try:
                 made = list(_tables(law))
             except Exception as error:  # of a user's law, which may do anything; the fit itself is whole
@@ -109,16 +109,16 @@ class _Law:
     model: Any
     effect: Effect
     location: str
-    amplitudes: tuple[str, ...]
+    coefficients: tuple[str, ...]
     values: dict[str, float]
     spread: dict[str, float]
 
     @property
     def parameters(self) -> list[str]:
-        """What of the fit it reads: its amplitudes here, and its shapes."""
+        """What of the fit it reads: its coefficients here, and its shapes."""
         own = {p.name for p in self.effect.parameters if not p.writes}
         others = {n for at, names in self.effect.locations.items() if at != self.location for n in names}
-        return [n for n in self.values if n in own and (n in self.amplitudes or n not in others)]
+        return [n for n in self.values if n in own and (n in self.coefficients or n not in others)]
 
     def probe(self, name: str) -> float:
         """A value at which the law is there: the fitted one, or what draws may have where that is zero."""
@@ -247,9 +247,9 @@ class _Law:
         return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
 
     def _made(self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> LawTable:
-        """Terms by linear amplitudes; all other parameters are axes of the table."""
+        """Terms by linear coefficients; all other parameters are axes of the table."""
         names, values = self.parameters, self.values
-        linear = [n for n in names if n in self.amplitudes and self._linear(n, axes, at)]
+        linear = [n for n in names if n in self.coefficients and self._linear(n, axes, at)]
         shapes = [n for n in names if n not in linear]
         deviation = {n: 4.0 * self.spread.get(n, 0.0) for n in shapes}
         bounds = {p.name: (p.low, p.high) for p in self.effect.parameters}
@@ -287,11 +287,11 @@ class _Law:
         )
 
     def _linear(self, name: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> bool:
-        """Whether the law is this amplitude times something, beside the others' parts."""
+        """Whether the law is this coefficient times something, beside the others' parts."""
         x = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
         count = len(x)
         given = {n: np.full(count, self.values[n]) for n in self.parameters}
-        zero = {n: (np.zeros(count) if n in self.amplitudes else v) for n, v in given.items()}
+        zero = {n: (np.zeros(count) if n in self.coefficients else v) for n, v in given.items()}
         size = self.values[name] or 1.0
         none, one, two = (at({**zero, name: np.full(count, k * size)}, x) for k in (0.0, 1.0, 2.0))
         rest = at({**given, name: np.zeros(count)}, x)

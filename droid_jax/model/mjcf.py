@@ -20,7 +20,7 @@ from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumb
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import SOFT_IMPEDANCE, Scene
-from droid_jax.model.visual_geoms import compiled, keep_inertia, look_geoms, weigh
+from droid_jax.model.visual_geoms import compiled, keep_inertia, visual_geoms, weigh
 
 # Model field -> attribute of the element that holds a row of it, or its first numbers.
 _ATTRIBUTES = {
@@ -328,7 +328,7 @@ def is_angle(field: str) -> bool:
 
 def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int, Any]]:
     """For each beginning of a field's name, the elements by their row in the scene's model, which has no looks."""
-    looks = {g.id for g in look_geoms(spec)}
+    looks = {g.id for g in visual_geoms(spec)}
     geoms = sorted((g for g in spec.geoms if g.id not in looks), key=lambda g: g.id)
     return {
         "dof": {int(model.jnt_dofadr[j.id]): j for j in spec.joints},

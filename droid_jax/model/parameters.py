@@ -3,7 +3,7 @@
 A `Parameter` says what it is (name, unit, bounds, initial mean and deviation) and what it
 writes: fields of the MuJoCo model (`writes`), or one entry of `theta`, the dictionary of
 quantities that live outside the model (a time offset, a torque offset, an effect's
-amplitude).  A `Space` is an ordered tuple of them; a parameter vector is an array [..., D]
+coefficient).  A `Space` is an ordered tuple of them; a parameter vector is an array [..., D]
 of physical values in that order.
 
 Search coordinates: the search and the Gaussian move in coordinates x [..., D] in which one

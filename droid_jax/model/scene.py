@@ -1,6 +1,6 @@
 """A scene: an MJCF compiled once, with its names turned into ids once.
 
-`load_scene` takes a user's own MJCF, `model.door_scene` composes the built-in one.  Replays use a
+`load_scene` takes a user's own MJCF, `door.scene.door_scene` composes the built-in one.  Replays use a
 model without the geoms of group 2 that touch nothing: they are only for the eye (their mass counts).
 """
 
@@ -21,7 +21,7 @@ from droid_jax import arguments
 from droid_jax.arguments import said
 from droid_jax.model.actuators import actuator_names, drives_joint, of_joint
 from droid_jax.model.unsupported_features import check_options, refuse_ignored, refuse_missing
-from droid_jax.model.visual_geoms import compiled, look_geoms, without_looks
+from droid_jax.model.visual_geoms import compiled, visual_geoms, without_visual_geoms
 from droid_jax.runtime import first_device
 
 LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
@@ -193,11 +193,11 @@ class Scene:
         return hashlib.sha256(model.tobytes()).hexdigest()
 
     @functools.cached_property
-    def geoms_among_looks(self) -> np.ndarray:
+    def full_geom_ids(self) -> np.ndarray:
         """[ngeom] the id that each geom of the model has where the looks are there too: in the MJCF as it was given."""
         spec = self.spec.copy()
         compiled(spec)  # numbers the geoms
-        looks = {geom.id for geom in look_geoms(spec)}
+        looks = {geom.id for geom in visual_geoms(spec)}
         return np.array([geom.id for geom in spec.geoms if geom.id not in looks], dtype=int)
 
     def visual_model(self) -> mujoco.MjModel:
@@ -288,7 +288,7 @@ def compile_scene(
     arguments.one_of(engine, "engine", ("mjx", "mujoco"))
     joints = None if joints is None else arguments.names(joints, "joints")
     object_joint = None if object_joint is None else arguments.name(object_joint, "object_joint")
-    bare, free = without_looks(spec), set(unlimited)
+    bare, free = without_visual_geoms(spec), set(unlimited)
     for joint in bare.joints:
         if joint.name in free:
             joint.limited = False

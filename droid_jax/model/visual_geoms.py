@@ -11,7 +11,7 @@ import numpy as np
 LOOK_GROUP = 2
 
 
-def look_geoms(spec: mujoco.MjSpec) -> list[Any]:
+def visual_geoms(spec: mujoco.MjSpec) -> list[Any]:
     """The geoms for the eye: of LOOK_GROUP, nothing can touch them, and no pair, tendon or sensor names them."""
     used = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     used |= {w.target.name for t in spec.tendons for w in t.path if isinstance(w.target, mujoco.MjsGeom)}
@@ -25,10 +25,10 @@ def look_geoms(spec: mujoco.MjSpec) -> list[Any]:
     ]
 
 
-def without_looks(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A copy without `look_geoms`, whose bodies weigh what they weighed with them."""
+def without_visual_geoms(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """A copy without `visual_geoms`, whose bodies weigh what they weighed with them."""
     bare = spec.copy()
-    looks = look_geoms(bare)
+    looks = visual_geoms(bare)
     if looks:
         whole = compiled(bare)
         _weigh_emptied(bare, whole, {geom.id for geom in looks})

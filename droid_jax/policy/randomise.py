@@ -110,7 +110,7 @@ def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, n
     ValueError where a field's shape is of another scene.
     """
     looks = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
-    rows = {field: scene.geoms_among_looks for field in fields if looks and field.startswith("geom_")}
+    rows = {field: scene.full_geom_ids for field in fields if looks and field.startswith("geom_")}
     for field in fields:
         own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
         if own != given and not (field in rows and own[1:] == given[1:]):

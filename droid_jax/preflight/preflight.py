@@ -13,7 +13,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.closed_loops import OPEN, open_loops
-from droid_jax.simulate.initial_state import sent_columns, sent_to, told_start
+from droid_jax.simulate.initial_state import sent_columns, sent_to, stated_start
 from droid_jax.simulate.servo_gains import gains_note
 
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
@@ -95,7 +95,7 @@ def closed_loop(scene: Scene, recording: Recording) -> str:
     """What is to be known where the recording starts with a closed loop open, which other joints then close."""
     if not recording.command.size or not scene.model.neq:
         return ""
-    wide = [loop for loop in open_loops(scene, told_start(scene, recording)) if loop.turn > OPEN]
+    wide = [loop for loop in open_loops(scene, stated_start(scene, recording)) if loop.turn > OPEN]
     if not wide:
         return ""
     return (

@@ -2,7 +2,7 @@
 
 One motion is commanded once per repeat; the command is the same each time, the measurements
 differ.  Every channel keeps its own clock, so a door angle filmed at 30 Hz can stand beside
-torques at 1 kHz.  What was not measured is masked, never filled in.  `measure.checks` says what
+torques at 1 kHz.  What was not measured is masked, never filled in.  `recordings.checks` says what
 a recording must fulfil.
 """
 
@@ -114,7 +114,8 @@ class Recording:
         command_names: U joint names.
         channels: name -> Channel; all share N.
         torque: what the torque channel holds.
-        qpos0: joint name -> position at the start, rad or m; joints not named start where the scene has them.
+        qpos0: joint name -> position at the start, rad or m; joints not named start where they were first
+            measured, else at their first command, else where the scene has them.
         gains: servo gains, when known.
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.

@@ -130,9 +130,9 @@ def _check_halves(recording: Recording) -> None:
     if recording.repeats >= HALVES:
         return
     raise ValueError(
-        f"recording {recording.name!r} is the only one and has {_repeats(recording)}: one half must fit and the other "
-        f"validation, and with fewer than {FEWEST_REPEATS} repeats in a half no effect can be told from chance. Record "
-        f"{HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
+        f"recording {recording.name!r} is the only one and has {_repeats(recording)}: half of its repeats train and "
+        f"half validate, and with fewer than {FEWEST_REPEATS} repeats in a half no effect stands out from "
+        f"chance. Record {HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
         f"--recording TRAIN VALIDATION. {ELSE}"
         + (BY_STRETCHES if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
     )

@@ -199,7 +199,7 @@ def known_base(
 
 
 def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recording: Recording) -> np.ndarray | None:
-    """[M] what far finer time steps change of the base model, in one repeat's noise; None in inverse mode.
+    """[M] what far finer time steps change of the base model, in one repeat's noise; None without commands.
 
     In plain C, where nothing is compiled.  Its error is of first order in the step: of two steps' it is extrapolated
     to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.

@@ -11,7 +11,7 @@ from mujoco import rollout
 
 from droid_jax import runtime
 from droid_jax.model.scene import Scene
-from droid_jax.model.visual_geoms import without_looks
+from droid_jax.model.visual_geoms import without_visual_geoms
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ def instrument(scene: Scene) -> mujoco.MjModel:
     Recompiled from the scene's spec, then given the scene's own numbers, so that options and
     fields changed after compilation are kept.
     """
-    spec = without_looks(scene.spec)
+    spec = without_visual_geoms(scene.spec)
     for sensor in list(spec.sensors):  # the file's own would stand before ours
         spec.delete(sensor)
     for kind in ("JOINTACTFRC", "JOINTPOS", "JOINTVEL"):

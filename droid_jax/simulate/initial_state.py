@@ -57,7 +57,7 @@ def start_pose(scene: Scene, recording: Recording, config: StartConfig = DEFAULT
             scene.qpos(joint)
         except ValueError as error:
             raise ValueError(f"recording {recording.name!r}, qpos0: {error}") from None
-    told = _told(scene, recording, config)
+    told = _stated(scene, recording, config)
     asked = {*scene.needs_command, *recording.command_names}
     guessed = [j for j in scene.driven_joints if j in asked and j not in told]
     if guessed:
@@ -75,12 +75,12 @@ def start_pose(scene: Scene, recording: Recording, config: StartConfig = DEFAULT
     return qpos
 
 
-def told_start(scene: Scene, recording: Recording, config: StartConfig = DEFAULT_START) -> np.ndarray:
+def stated_start(scene: Scene, recording: Recording, config: StartConfig = DEFAULT_START) -> np.ndarray:
     """[nq] where the motion starts, before the joints of closed loops are moved to close them."""
-    return _coupled(scene, _told(scene, recording, config))
+    return _coupled(scene, _stated(scene, recording, config))
 
 
-def _told(scene: Scene, recording: Recording, config: StartConfig) -> dict[str, float]:
+def _stated(scene: Scene, recording: Recording, config: StartConfig) -> dict[str, float]:
     """Joint -> where it starts, rad or m, of those of which the recording says it."""
     sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
     return {**sent, **_measured(scene, recording, config.ajar), **recording.qpos0}

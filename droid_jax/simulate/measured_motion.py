@@ -23,7 +23,7 @@ EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbou
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A measured motion of some joints, for the inverse mode.
+    """A measured motion of some joints, for logs without commands.
 
     joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
     slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.

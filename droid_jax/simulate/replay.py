@@ -1,8 +1,8 @@
 """Replay one recording in simulation: the servo mode, a loop over time steps.
 
 `servo_replay` follows the recorded command through grasp and pull, as the paper does.  Recordings
-without commands are replayed by `compare.inverse`.  Both return a function Physics -> Rollout for
-ONE sample; `compare.population` makes a compiled, sharded batch of it.
+without commands are replayed by `simulate.inverse_dynamics`.  Both return a function Physics -> Rollout for
+ONE sample; `simulate.batching` makes a compiled, sharded batch of it.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     """
     if recording.command.size == 0:
         raise ValueError(
-            f"recording {recording.name!r} holds no commands, so its servo cannot be replayed; use the inverse mode"
+            f"recording {recording.name!r} holds no commands, so its servo cannot be replayed, only its "
+            "measured motion (`simulate.inverse_dynamics`)"
         )
     _check_driven(scene, recording)
     columns = scene.command_index(recording.command_names)

@@ -53,7 +53,7 @@ def test_distances_are_of_the_instants_that_count(log: LoneLog):
 def test_repeats_are_refused_and_parts_have_names_of_their_own(log: LoneLog):
     scene = elbow()
     space = elbow_space(scene)
-    with pytest.raises(ValueError, match="'elbow' has 2 repeats: use make_case"):
+    with pytest.raises(ValueError, match="'elbow' has 2 repeats, and a log in blocks has one"):
         lone_log(scene, space, elbow_log(COULOMB, 8.0, 2), CONFIG.compare)
     assert log.part("another").comparisons[0].name == "another" and log.comparisons[0].name == "elbow"
 

@@ -88,7 +88,7 @@ def test_the_thresholds_are_those_of_the_published_runs():
         significance=0.01, nuisance_bound=3.0, prior_slack=3.0, collinear=0.9, confirmation=0.05, least_gain=0.2,
         least_further_gain=0.4, least_share=0.05, stability=0.8, resamples=400, interval_level=0.9, bound_margin=0.02,
         equivalence_factor=3.0, equivalence_doubt=0.05, equal_fit=0.05, simplest_factor=1.25, simplest_share=0.01,
-        generality_factor=0.9, open_share=0.1, minimum_closed=0.4, mostly_explained=0.5, shape_told=0.5,
+        generality_factor=0.9, open_share=0.1, minimum_closed=0.4, mostly_explained=0.5, shape_interval_share=0.5,
         false_discovery_rate=0.1,
     )  # fmt: skip
     assert BlocksConfig() == BlocksConfig(1.5, 0.5, 2 / 3, 0.2, 0.3, 0.08, 1.5, 30.0)

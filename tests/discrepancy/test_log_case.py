@@ -194,7 +194,7 @@ def test_a_test_log_has_torque_offsets_of_its_own(off: float):
 
 def test_repeats_need_no_blocks():
     scene = elbow()
-    with pytest.raises(ValueError, match="'elbow' has 2 repeats: use make_case"):
+    with pytest.raises(ValueError, match="'elbow' has 2 repeats, and a log in blocks has one"):
         make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB, 8.0, 2), CONFIG)
     few = {"train": elbow_log(COULOMB, 8.0, 5), "validation": replace(elbow_log(COULOMB, 9.0, 5), name="other")}
     with pytest.raises(ValueError, match="recordings elbow, other: at least 8 repeats are needed"):

@@ -369,7 +369,7 @@ def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
     for compiler in ("", '<compiler inertiafromgeom="true"/>'):
         whole = mujoco.MjModel.from_xml_string(xml.format(compiler=compiler))
         scene = compile_scene(mujoco.MjSpec.from_string(xml.format(compiler=compiler)), "covered")
-        assert [whole.geom(int(i)).name for i in scene.geoms_among_looks] == kept
+        assert [whole.geom(int(i)).name for i in scene.full_geom_ids] == kept
         for model in (scene.model, instrument(scene)):
             assert [model.geom(i).name for i in range(model.ngeom)] == kept
             for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_M0"):

@@ -520,7 +520,7 @@ def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
 
 def test_a_recording_without_commands_is_refused(scene: Scene):
     log = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
-    with pytest.raises(ValueError, match=r"'wave' holds no commands.*inverse mode"):
+    with pytest.raises(ValueError, match=r"'wave' holds no commands.*measured motion"):
         make_drive(scene, log)
 
 

@@ -23,7 +23,7 @@ def angle_friction(scene: Scene) -> Effect | None:
 
     return Effect(
         "angle_friction",
-        (a.amplitude(SLOPE, "N m/rad", 0.5, 5.0), a.amplitude(CURVE, "N m/rad^2", 0.5, 5.0)),
+        (a.coefficient(SLOPE, "N m/rad", 0.5, 5.0), a.coefficient(CURVE, "N m/rad^2", 0.5, 5.0)),
         frictionloss=frictionloss,
         description="dry friction of the hinge that changes with the door's angle",
         signature="hysteresis over the angle: opening and closing differ more at some angles",

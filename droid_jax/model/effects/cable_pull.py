@@ -31,6 +31,6 @@ def cable_pull(scene: Scene) -> Effect | None:
         signature="smooth in the position of one joint, the same at every speed",
         confused_with=("payload", "torque_bias"),
         special_cases=("torque_bias",),  # a pull that does not change with the angle
-        locations=a.places(joints, STIFFNESS, PULL),
+        locations=a.locations(joints, STIFFNESS, PULL),
         minimum_size=0.1,
     )

@@ -85,6 +85,6 @@ def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
             out.append(Candidate(effect.name, location, coefficients, shape))
     if not out:
         raise ValueError(
-            "effects: there is nothing to ask about, none of the effects says its locations (`Effect.locations`)"
+            "effects: there is nothing to test, since none of the effects states its locations (`Effect.locations`)"
         )
     return tuple(out)

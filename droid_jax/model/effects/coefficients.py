@@ -19,7 +19,7 @@ RELIEF = 1.5
 EXPONENTS = (1.0, 2.0)  # of a damper, of Stribeck's excess
 
 
-def amplitude(
+def coefficient(
     name: str, unit: str, typical: float, high: float, *, low: float | None = None, role: Role = Role.OTHER
 ) -> Parameter:
     """A size that is zero at neutral; typical: its prior deviation; low: -high unless given."""
@@ -27,7 +27,7 @@ def amplitude(
 
 
 def shape(name: str, unit: str, values: Sequence[float], low: float, high: float) -> Parameter:
-    """A width, position or speed that matters only beside an amplitude; it starts at the middle of `values`."""
+    """A width, position or speed that matters only beside a coefficient; it starts at the middle of `values`."""
     ordered = sorted(values)
     return Parameter(name, unit, ordered[len(ordered) // 2], (high - low) / 4, low, high, group=GROUP)
 
@@ -55,12 +55,12 @@ def arm_qpos(scene: Scene) -> np.ndarray:
 def of_joints(
     name: str, joints: Sequence[str], unit: str, typical: float, high: float, *, low: float | None = None
 ) -> tuple[Parameter, ...]:
-    """One amplitude a joint, `name[joint]`."""
-    return tuple(amplitude(f"{name}[{j}]", unit, typical, high, low=low) for j in joints)
+    """One coefficient a joint, `name[joint]`."""
+    return tuple(coefficient(f"{name}[{j}]", unit, typical, high, low=low) for j in joints)
 
 
-def places(joints: Sequence[str], *names: str) -> dict[str, tuple[str, ...]]:
-    """place -> amplitudes, for effects with the amplitudes `names` in every joint."""
+def locations(joints: Sequence[str], *names: str) -> dict[str, tuple[str, ...]]:
+    """location -> coefficients, for effects with the coefficients `names` in every joint."""
     return {j: tuple(f"{n}[{j}]" for n in names) for j in joints}
 
 

@@ -23,7 +23,7 @@ def command_delay(scene: Scene) -> Effect | None:
         return None
     return Effect(
         COMMAND,
-        (a.amplitude(COMMAND, "s", 0.005, 0.05, low=-0.01),),
+        (a.coefficient(COMMAND, "s", 0.005, 0.05, low=-0.01),),
         command=lambda theta, time, look: look(time - a.value(theta, COMMAND)),
         description="commands that reach the servo late",
         signature="all joints, in proportion to the commanded speed; torques and positions shift together",
@@ -49,7 +49,7 @@ def sensor_delay(scene: Scene) -> Effect | None:
 
     return Effect(
         SENSOR,
-        (a.amplitude(SENSOR, "s", 0.005, 0.05, low=-0.01),),
+        (a.coefficient(SENSOR, "s", 0.005, 0.05, low=-0.01),),
         observe=observe,
         description="torques that are recorded late",
         signature="all joints, where torques change fast; positions stay",
@@ -66,7 +66,7 @@ def clock_rate(scene: Scene) -> Effect | None:
         return None
     return Effect(
         RATE,
-        (a.amplitude(RATE, "-", 1e-3, 0.02),),
+        (a.coefficient(RATE, "-", 1e-3, 0.02),),
         command=lambda theta, time, look: look(time * (1.0 + a.value(theta, RATE))),
         description="commands and measurements on clocks of different rates",
         signature="a delay of all joints that grows steadily over the recording",
@@ -96,6 +96,6 @@ def velocity_feedforward(scene: Scene) -> Effect | None:
         description="a servo that is also given its command's speed, or less of it than the model's",
         signature="tracking error of one joint in proportion to its commanded speed",
         confused_with=(COMMAND, "servo_gain"),
-        locations=a.places(joints, AHEAD),
+        locations=a.locations(joints, AHEAD),
         minimum_size=1e-3,
     )

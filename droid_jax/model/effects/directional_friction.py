@@ -27,7 +27,7 @@ def joint_directional(scene: Scene) -> Effect | None:
         description="dry friction of a joint of the arm that differs between its two directions",
         signature="an offset that comes and goes with the direction of that joint",
         confused_with=("joint_coulomb", "torque_bias"),
-        locations=a.places(joints, JOINT),
+        locations=a.locations(joints, JOINT),
         minimum_size=0.03,
     )
 
@@ -46,7 +46,7 @@ def hinge_directional(scene: Scene) -> Effect | None:
 
     return Effect(
         HINGE,
-        (a.amplitude(HINGE, "N m", 0.3, 3.0),),
+        (a.coefficient(HINGE, "N m", 0.3, 3.0),),
         frictionloss=frictionloss,
         description="dry friction of the hinge that differs between opening and closing",
         signature="a step at the door's reversals",

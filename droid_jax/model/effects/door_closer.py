@@ -24,7 +24,7 @@ def door_closer(scene: Scene) -> Effect | None:
 
     return Effect(
         "door_closer",
-        (a.amplitude(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0), a.shape(EXPONENT, "-", a.EXPONENTS, 0.8, 2.2)),
+        (a.coefficient(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0), a.shape(EXPONENT, "-", a.EXPONENTS, 0.8, 2.2)),
         force=force,
         description="a door closer's damper, which brakes while the door closes",
         signature="closing only, growing with speed",

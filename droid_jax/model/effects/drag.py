@@ -21,7 +21,7 @@ def drag(scene: Scene) -> Effect | None:
 
     return Effect(
         DRAG,
-        (a.amplitude(DRAG, "N m s^2/rad^2", 0.5, 20.0, low=0.0),),
+        (a.coefficient(DRAG, "N m s^2/rad^2", 0.5, 20.0, low=0.0),),
         force=force,
         description="drag of the door that grows with the square of its speed",
         signature="the contrast between fast and slow stretches",

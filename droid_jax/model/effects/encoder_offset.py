@@ -35,7 +35,7 @@ def encoder_offset(scene: Scene) -> Effect | None:
         description="an encoder whose zero is not the model's",
         signature="weight that goes by another angle of one joint, and inertia with it",
         confused_with=("gravity_direction", "payload", "cable_pull", "torque_bias"),
-        locations=a.places(joints, ENCODER),
+        locations=a.locations(joints, ENCODER),
         minimum_size=2e-3,
     )
 

@@ -40,7 +40,7 @@ def gravity_direction(scene: Scene) -> Effect | None:
 
     return Effect(
         "gravity_direction",
-        tuple(a.amplitude(name, "rad", 0.01, 0.1) for name in names),
+        tuple(a.coefficient(name, "rad", 0.01, 0.1) for name in names),
         force=force,
         description="a base that is not level, which the gravity compensation takes for upright",
         signature="all joints that carry weight, smooth in their angles, the same at every speed",

@@ -22,7 +22,7 @@ def hardening_spring(scene: Scene) -> Effect | None:
 
     return Effect(
         "hardening_spring",
-        (a.amplitude(SQUARE, "N m/rad^2", 0.5, 5.0), a.amplitude(CUBE, "N m/rad^3", 0.5, 5.0)),
+        (a.coefficient(SQUARE, "N m/rad^2", 0.5, 5.0), a.coefficient(CUBE, "N m/rad^3", 0.5, 5.0)),
         force=force,
         description="a hinge spring that gets stiffer the further the door opens",
         signature="late in the opening, the same at every speed and in both directions",

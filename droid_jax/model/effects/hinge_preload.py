@@ -23,7 +23,7 @@ def hinge_preload(scene: Scene) -> Effect | None:
 
     return Effect(
         NAME,
-        (a.amplitude(NAME, "N m", 0.5, 5.0, role=Role.OBJECT_TORQUE),),
+        (a.coefficient(NAME, "N m", 0.5, 5.0, role=Role.OBJECT_TORQUE),),
         force=lambda theta, state: a.at_dof(scene, joint, -a.value(theta, NAME)),
         native=native,
         description="a constant torque that closes (or opens) the door",

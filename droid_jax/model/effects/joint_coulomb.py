@@ -29,6 +29,6 @@ def joint_coulomb(scene: Scene) -> Effect | None:
         description="dry friction in a joint of the arm",
         signature="a step at every reversal of that joint, in all phases",
         confused_with=("joint_stribeck", "joint_directional", "load_friction"),
-        locations=a.places(joints, LOSS),
+        locations=a.locations(joints, LOSS),
         minimum_size=0.03,
     )

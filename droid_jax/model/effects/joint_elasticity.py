@@ -100,7 +100,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
     def parameter(joint: str, stiffness: float):
         # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
-        return a.amplitude(
+        return a.coefficient(
             f"{COMPLIANCE}[{joint}]", "rad/(N m)", 1e-4, max(1e-3, 0.3 / stiffness), low=-min(1e-4, 0.5 / stiffness)
         )
 
@@ -111,7 +111,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         description="an elastic gear between motor and link",
         signature="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),
-        locations=a.places(servos.joints, COMPLIANCE),
+        locations=a.locations(servos.joints, COMPLIANCE),
         minimum_size=2e-5,
     )
 
@@ -136,6 +136,6 @@ def joint_backlash(scene: Scene) -> Effect | None:
         description="backlash in a joint's gear",
         signature="a step where the load of that joint changes sign",
         confused_with=("joint_coulomb", "joint_compliance"),
-        locations=a.places(servos.joints, BACKLASH),
+        locations=a.locations(servos.joints, BACKLASH),
         minimum_size=3e-4,
     )

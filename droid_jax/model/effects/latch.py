@@ -32,7 +32,7 @@ def latch(scene: Scene) -> Effect | None:
     return Effect(
         "latch",
         (
-            a.amplitude(TORQUE, "N m", 1.0, 25.0, low=0.0),
+            a.coefficient(TORQUE, "N m", 1.0, 25.0, low=0.0),
             a.shape(WIDTH, "rad", WIDTHS, 0.01, 0.2),
             a.shape(EXPONENT, "-", EXPONENTS, 0.5, 2.5),
         ),

@@ -34,7 +34,7 @@ def load_friction(scene: Scene) -> Effect | None:
         description="friction of a joint of the arm that grows with its load",
         signature="steps at that joint's reversals that grow with its torque",
         confused_with=("joint_coulomb", "torque_gain"),
-        locations=a.places(joints, SHARE),
+        locations=a.locations(joints, SHARE),
         minimum_size=0.01,
     )
 
@@ -71,7 +71,7 @@ def gear_friction(scene: Scene) -> Effect | None:
         signature="steps at that joint's reversals that grow with its torque, higher where it lifts and at low speed",
         confused_with=(SHARE, "joint_stribeck", "joint_coulomb", "servo_gain"),
         special_cases=(SHARE,),
-        locations=a.places(joints, MOTOR, LINKS, AT_REST),
+        locations=a.locations(joints, MOTOR, LINKS, AT_REST),
         shape_parameters={SPEED: SPEEDS},
         minimum_size=0.02,
     )

@@ -29,7 +29,7 @@ def opening_check(scene: Scene) -> Effect | None:
     return Effect(
         "opening_check",
         (
-            a.amplitude(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0),
+            a.coefficient(DAMPING, "N m s/rad", 2.0, 6.0, low=0.0),
             a.shape(ANGLE, "rad", ANGLES, 0.1, 1.2),
             a.shape(EXPONENT, "-", a.EXPONENTS, 0.8, 2.2),
         ),

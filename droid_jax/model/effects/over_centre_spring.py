@@ -24,7 +24,7 @@ def over_centre_spring(scene: Scene) -> Effect | None:
 
     return Effect(
         "over_centre_spring",
-        (a.amplitude(TORQUE, "N m", 1.0, 25.0, low=0.0), a.shape(ANGLE, "rad", ANGLES, 0.05, 0.9)),
+        (a.coefficient(TORQUE, "N m", 1.0, 25.0, low=0.0), a.shape(ANGLE, "rad", ANGLES, 0.05, 0.9)),
         force=force,
         description="a self-closing hinge whose spring pulls hardest at a small angle and fades further out",
         signature="5 to 30 degrees of opening, in both directions",

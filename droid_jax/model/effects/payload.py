@@ -34,7 +34,7 @@ def payload(scene: Scene) -> Effect | None:
     last, body = carried
     more = _more_mass(scene, body, MASS, Role.PAYLOAD_MASS)
     weighs = _weighs(scene, last, body)
-    parameters = (more,) if weighs is None else (more, a.amplitude(MOMENT, "kg m", 0.02, 0.3))
+    parameters = (more,) if weighs is None else (more, a.coefficient(MOMENT, "kg m", 0.02, 0.3))
     return Effect(
         "payload",
         parameters,
@@ -65,7 +65,7 @@ def free_payload(scene: Scene) -> Effect | None:
         return None
     return Effect(
         "free_payload",
-        (_more_mass(scene, body, LOAD), *(a.amplitude(name, "kg m", 0.02, 0.3) for name in names)),
+        (_more_mass(scene, body, LOAD), *(a.coefficient(name, "kg m", 0.02, 0.3) for name in names)),
         force=force,
         description="a tool or load with a centre off the hand's own line, that the controller does not know of",
         signature="free motion: all joints, in proportion to levers that turn with the hand",

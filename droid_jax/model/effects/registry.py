@@ -85,12 +85,12 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
 def checked(effect: Effect) -> Effect:
     """The effect; ValueError where it is not well made.
 
-    It must have the parameters that it speaks of, amplitudes that are neutral at 0 and linear, and shapes whose values
-    to try lie within their bounds.
+    It must have the parameters that it speaks of, coefficients that are neutral at 0 and linear, and shapes whose
+    values to try lie within their bounds.
     """
     own = {p.name: p for p in effect.parameters}
-    amplitudes = [name for place in effect.locations.values() for name in place]
-    for name in (*amplitudes, *effect.shape_parameters):
+    coefficients = [name for place in effect.locations.values() for name in place]
+    for name in (*coefficients, *effect.shape_parameters):
         if name not in own:
             raise ValueError(
                 f"effect {effect.name!r} speaks of a parameter {name!r} that it does not have; it has: {', '.join(own)}"
@@ -101,14 +101,14 @@ def checked(effect: Effect) -> Effect:
                 f"effect {effect.name!r}: values to try of its shape {p.name!r} lie outside its bounds "
                 f"[{p.low:g}, {p.high:g}]: {', '.join(f'{v:g}' for v in strange)}"
             )
-    for p in (own[name] for name in amplitudes):
+    for p in (own[name] for name in coefficients):
         if p.mean != 0.0:  # `Parameter` itself sees that the mean lies within the bounds
             raise ValueError(
-                f"effect {effect.name!r}: an amplitude is neutral at 0, but {p.name!r} starts at {p.mean:g} {p.unit} "
+                f"effect {effect.name!r}: a coefficient is neutral at 0, but {p.name!r} starts at {p.mean:g} {p.unit} "
                 f"with bounds [{p.low:g}, {p.high:g}]; let its bounds hold 0 and its mean be 0"
             )
         if p.scaling is not Scaling.LINEAR:
-            raise ValueError(f"effect {effect.name!r}: the amplitude {p.name!r} must be scaled linearly, as marks are")
+            raise ValueError(f"effect {effect.name!r}: the coefficient {p.name!r} must be scaled linearly")
     return effect
 
 
@@ -141,7 +141,7 @@ def joined(base: Space, effects: Iterable[Effect]) -> Space:
 
 
 def beside(base: Space, effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects less their places where the base has the sensor parameters that they would ask about.
+    """Effects less their locations where the base has the sensor parameters that they would test.
 
     A sensor's gain or an encoder's offset that is fitted as a parameter is no missing effect there, and neither is a
     load on a body whose whole inertia is one.

@@ -29,6 +29,6 @@ def servo_gain(scene: Scene) -> Effect | None:
         description="a servo whose position gain is not the stated one",
         signature="tracking error of one joint",
         confused_with=("joint_compliance", "command_delay", "torque_gain"),
-        locations=a.places(joints, GAIN),
+        locations=a.locations(joints, GAIN),
         minimum_size=0.02,
     )

@@ -48,7 +48,7 @@ def profile_acceleration(scene: Scene) -> Effect | None:
         description="a servo that limits how fast its goal speeds up",
         signature="fast changes of that joint's command: amplitudes that fall, and lag that grows, with its frequency",
         confused_with=("velocity_feedforward", "command_delay", "servo_gain", SPEED),
-        locations=a.places(joints, ACCELERATION),
+        locations=a.locations(joints, ACCELERATION),
         minimum_size=0.002,
     )
 
@@ -79,7 +79,7 @@ def profile_speed(scene: Scene) -> Effect | None:
         description="a servo that limits how fast its goal moves",
         signature="large steps of that joint's command, which become ramps of one slope",
         confused_with=("command_delay", "servo_gain", ACCELERATION),
-        locations=a.places(joints, SPEED),
+        locations=a.locations(joints, SPEED),
         minimum_size=0.02,
     )
 

@@ -38,7 +38,7 @@ def soft_friction(scene: Scene) -> Effect | None:
         confused_with=("joint_coulomb", "joint_stribeck", "servo_gain"),
         remedy="MuJoCo's own friction lets joints creep that stand still. Take solimpfriction of these joints from "
         "extended.patch into the MJCF, or fit with --joint-friction held",
-        locations={**a.places(tuple(writes), FIRMNESS), **together},
+        locations={**a.locations(tuple(writes), FIRMNESS), **together},
         minimum_size=0.1,
         natural_bounds=tuple(names.values()),
     )

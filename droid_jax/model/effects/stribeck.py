@@ -44,7 +44,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
         signature="breakaway and reversals of that joint",
         confused_with=("joint_coulomb",),
         special_cases=("joint_coulomb",),  # a speed beyond all that the joint has
-        locations=a.places(joints, JOINT),
+        locations=a.locations(joints, JOINT),
         shape_parameters={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
         minimum_size=0.05,
     )
@@ -64,7 +64,7 @@ def hinge_stribeck(scene: Scene) -> Effect | None:
     return Effect(
         HINGE,
         (
-            a.amplitude(HINGE, "N m", 0.5, 3.0, low=0.0),
+            a.coefficient(HINGE, "N m", 0.5, 3.0, low=0.0),
             a.shape(HINGE_SPEED, "rad/s", SPEEDS, 0.005, 0.2),
             a.shape(HINGE_EXPONENT, "-", a.EXPONENTS, 1.0, 2.5),
         ),

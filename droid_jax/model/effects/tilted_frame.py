@@ -23,7 +23,7 @@ def tilted_frame(scene: Scene) -> Effect | None:
 
     return Effect(
         "tilted_frame",
-        (a.amplitude(SINE, "N m", 0.3, 3.0), a.amplitude(COSINE, "N m", 0.3, 3.0)),
+        (a.coefficient(SINE, "N m", 0.3, 3.0), a.coefficient(COSINE, "N m", 0.3, 3.0)),
         force=force,
         description="a frame out of plumb, so that gravity moves the door",
         signature="smooth over the angle, the same at every speed and in both directions",

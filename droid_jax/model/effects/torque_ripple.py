@@ -39,7 +39,7 @@ def torque_ripple(scene: Scene) -> Effect | None:
         description="torque ripple of a joint's motor or gear",
         signature="periodic in the position of one joint",
         confused_with=("cable_pull",),
-        locations=a.places(joints, SINE, COSINE),
+        locations=a.locations(joints, SINE, COSINE),
         shape_parameters={PERIODS: COUNTS},
         minimum_size=0.02,
     )

@@ -28,7 +28,7 @@ def torque_bias(scene: Scene) -> Effect | None:
         description="a constant error of a joint's torque sensor",
         signature="one joint, the same throughout, also at rest",
         confused_with=("payload", "cable_pull"),
-        locations=a.places(scene.joints, BIAS),
+        locations=a.locations(scene.joints, BIAS),
         minimum_size=0.05,
     )
 
@@ -43,7 +43,7 @@ def torque_gain(scene: Scene) -> Effect | None:
         description="a wrong gain of a joint's torque sensor",
         signature="one joint, in proportion to its torque",
         confused_with=("servo_gain", "load_friction"),
-        locations=a.places(scene.joints, GAIN),
+        locations=a.locations(scene.joints, GAIN),
         minimum_size=0.01,
     )
 
@@ -63,7 +63,7 @@ def torque_drift(scene: Scene) -> Effect | None:
         description="a torque sensor that drifts during a recording",
         signature="one joint, growing steadily with time whatever moves",
         confused_with=("torque_bias", "cable_pull"),
-        locations=a.places(scene.joints, DRIFT),
+        locations=a.locations(scene.joints, DRIFT),
         minimum_size=0.005,
         over_time=True,
     )
@@ -89,7 +89,7 @@ def torque_crosstalk(scene: Scene) -> Effect | None:
               for i, j in enumerate(joints)}  # fmt: skip
     return Effect(
         CROSSTALK,
-        tuple(a.amplitude(name, "-", 0.03, 0.3) for of in places.values() for name in of),
+        tuple(a.coefficient(name, "-", 0.03, 0.3) for of in places.values() for name in of),
         observe=observe,
         description="a joint's torque sensor that also reads its neighbours' torques",
         signature="one joint, in proportion to the torque of the next or the last",

@@ -91,15 +91,15 @@ def typical(parameter: Parameter) -> float:
     return min(parameter.mean + parameter.std, parameter.high)
 
 
-def amplitudes(effect: Effect) -> list[Parameter]:
+def coefficients(effect: Effect) -> list[Parameter]:
     """Of all places."""
     names = {n for place in effect.locations.values() for n in place}
     return [p for p in effect.parameters if p.name in names]
 
 
 def everywhere(effect: Effect, value: Callable[[Parameter], float] = typical) -> dict[str, float]:
-    """All amplitudes of an effect at the value that a function gives them."""
-    return {p.name: value(p) for p in amplitudes(effect)}
+    """All coefficients of an effect at the value that a function gives them."""
+    return {p.name: value(p) for p in coefficients(effect)}
 
 
 def motion(time: np.ndarray) -> np.ndarray:

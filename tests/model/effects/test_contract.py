@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from effect_bench import Bench, amplitudes, bare, door, door_bench, everywhere, make_bench, mechanism, typical
+from effect_bench import Bench, bare, coefficients, door, door_bench, everywhere, make_bench, mechanism, typical
 
 from droid_jax.model.effect_interface import Effect, Rollout, State
 from droid_jax.model.effects.registry import library, registered
@@ -64,11 +64,11 @@ def test_the_name_is_the_registered_one(effect: Effect, request: pytest.FixtureR
 
 
 def test_parameters_are_amplitudes_and_shapes(effect: Effect):
-    """Each is one of the two, amplitudes of one place alone and zero at neutral."""
+    """Each is one of the two, coefficients of one place alone and zero at neutral."""
     named = [n for place in effect.locations.values() for n in place]
     assert named and all(effect.locations.values())
     assert sorted([*named, *effect.shape_parameters]) == sorted(p.name for p in effect.parameters)
-    for parameter in amplitudes(effect):
+    for parameter in coefficients(effect):
         assert parameter.mean == 0.0
         assert 0 < effect.minimum_size < parameter.high
         assert parameter.mean + parameter.std <= parameter.high
@@ -168,7 +168,7 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
 
 @pytest.mark.parametrize("effect", having("shape_parameters"), indirect=True)
 def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
-    loud = {p.name: jnp.float32(typical(p)) for p in amplitudes(effect)}
+    loud = {p.name: jnp.float32(typical(p)) for p in coefficients(effect)}
     stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shape_parameters}
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
     for state in moments(scene):
@@ -264,10 +264,10 @@ def check_neutral(bench: Bench, base: Rollout) -> None:
     assert neutral.finite and np.abs(base.torque).max() > 100 * NEUTRAL
 
 
-def check_amplitudes(bench: Bench, effect: Effect) -> None:
+def check_coefficients(bench: Bench, effect: Effect) -> None:
     """Each by itself, at a typical value and at its bounds, is seen and stays finite."""
     rows = [{}]
-    for p in amplitudes(effect):
+    for p in coefficients(effect):
         rows += [{p.name: value} for value in (typical(p), p.high, p.low) if value != p.mean]
     got = bench.run(np.array([bench.space.values(row) for row in rows]))
     assert got.finite.all() and np.isfinite(got.torque).all()
@@ -276,7 +276,7 @@ def check_amplitudes(bench: Bench, effect: Effect) -> None:
 
 
 def check_shapes(bench: Bench, effect: Effect) -> None:
-    """They do nothing by themselves, and every value of them is another effect beside an amplitude."""
+    """They do nothing by themselves, and every value of them is another effect beside a coefficient."""
     for name, values in effect.shape_parameters.items():
         shape = bench.space[name]
         tried = [{name: v} for v in sorted({*values, shape.low, shape.high})]
@@ -301,10 +301,10 @@ def test_neutral_is_the_scene_without_effects(small: Bench, small_bare: Rollout)
 
 
 def test_every_amplitude_is_seen(small: Bench, built_in: Effect):
-    check_amplitudes(small, built_in)
+    check_coefficients(small, built_in)
 
 
-def test_shapes_matter_beside_an_amplitude(small: Bench, built_in: Effect):
+def test_shapes_matter_beside_a_coefficient(small: Bench, built_in: Effect):
     check_shapes(small, built_in)
 
 
@@ -335,7 +335,7 @@ def test_on_the_door(real: Bench, name: str):
     # A only opens the door, which says nothing of a closer; C closes it again.
     bench = door_bench(names=[name], motion="C") if name == "door_closer" else real
     effect = bench.effect(name)
-    check_amplitudes(bench, effect)
+    check_coefficients(bench, effect)
     check_shapes(bench, effect)
     check_calm(bench, effect)
 

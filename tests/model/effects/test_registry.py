@@ -51,21 +51,21 @@ def edited(old: str, new: str, **options) -> Scene:
 
 
 def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
-    """A push at each of these joints, as a user would write it: theta is taken to hold every amplitude."""
+    """A push at each of these joints, as a user would write it: theta is taken to hold every coefficient."""
 
     def force(theta, state):
         return sum((jnp.zeros_like(state.qvel).at[k].set(theta[f"grease[{j}]"]) for k, j in enumerate(joints)))
 
-    amplitudes = tuple(Parameter(f"grease[{j}]", "N m", 0.0, 1.0, -5.0, 5.0) for j in joints)
+    coefficients = tuple(Parameter(f"grease[{j}]", "N m", 0.0, 1.0, -5.0, 5.0) for j in joints)
     shape = Parameter("thickness", "mm", 1.0, 1.0, 0.1, 5.0)
-    places = {j: (p.name,) for j, p in zip(joints, amplitudes, strict=True)}
+    places = {j: (p.name,) for j, p in zip(joints, coefficients, strict=True)}
 
     def native(values, model):
         return {("qpos_spring", k): 0.1 * values[f"grease[{j}]"] for k, j in enumerate(joints)}
 
     return Effect(
         name,
-        (*amplitudes, shape),
+        (*coefficients, shape),
         force=force,
         native=native,
         locations=places,
@@ -248,7 +248,7 @@ def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Ben
             return None
         return Effect(
             "wind",
-            (a.amplitude("wind", "N m", 0.5, 5.0),),
+            (a.coefficient("wind", "N m", 0.5, 5.0),),
             force=lambda theta, state: jnp.zeros_like(state.qvel).at[scene.dof(joint)].set(theta["wind"]),
             locations={joint: ("wind",)},
             minimum_size=0.1,
