@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -50,7 +51,9 @@ def test_positions_of_repeats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     check(found(tmp_path, recordings))
 
 
-def test_positions_of_one_commanded_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_positions_of_one_commanded_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """Beside it: whole replays, and another log that judges."""
     monkeypatch.setattr(made, "SECONDS", 18.0)
     logs = [swung("log", 1.0, 0.31, noise=NOISE, friction=FRICTION)]
@@ -64,3 +67,10 @@ def test_positions_of_one_commanded_log(tmp_path: Path, monkeypatch: pytest.Monk
     assert answer.open_loop is not None
     error = answer.open_loop.mean_mae["position"]
     assert error.unit == "rad" and error.before is not None and 0 < error.before < 0.2
+    run, log = str(tmp_path / "run"), str(tmp_path / "log.npz")
+    both = ["gap", "--recording", log, str(tmp_path / "judge.npz"), *write_pendulum(tmp_path), "--effects", *ASKED]
+    assert main([*both, "--out", run]) == 2 and "other settings" in capsys.readouterr().err  # it judged before
+    evaluate = ["evaluate-fit", "--fit", run, "--recording", log, str(tmp_path / "judge.npz")]
+    assert main([*evaluate, "--out", str(tmp_path / "evaluation")]) == 0
+    evaluated = json.loads((tmp_path / "evaluation" / "evaluation.json").read_text())
+    assert {r["name"]: r["fitted"] for r in evaluated["recordings"]} == {"log": True, "judge": False}

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import importlib.metadata
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from droid_jax.commands.folder import PATHS
 from droid_jax.files import CONFIG, EXTENDED, FIT, GAP
+from droid_jax.read_json import read_json
+from droid_jax.recordings.split import Split
 from droid_jax.report.stages import needs_whole, setup
 
 if TYPE_CHECKING:
@@ -115,8 +117,14 @@ def _extended(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitted
         after=model.values,
         engine="auto",
         config=compared(asked.get("motion_cutoff")),
-        recordings=tuple(asked.get("recordings_sha256", ())),
+        recordings=_fitted_by_search(folder, asked.get("recordings_sha256", ())),
     )
+
+
+def _fitted_by_search(folder: Path, hashes: Sequence[str]) -> tuple[str, ...]:
+    """Those of a search's recordings that its models were fitted to: the third of three motions is test data."""
+    by = read_json(folder / GAP).get("split", {}).get("by")
+    return tuple(hashes[:2] if by == Split.RECORDINGS.value else hashes)
 
 
 def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]) -> Scene:

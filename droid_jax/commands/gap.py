@@ -146,7 +146,9 @@ def run(command: GapCommand) -> None:
     hidden = {} if given else hidden_effects(command.hide, scene)
     effects = chosen_effects(command, scene, given)
     start = None if fit is None else values_of(fit, base)
-    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, given)}
+    fitted, judges = given[: len(command.recording)], given[len(command.recording) :]
+    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, fitted)}
+    setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if start is not None:
         setup["start"] = start.tolist()
     if finished(out, setup, command.again, GAP):
@@ -155,8 +157,6 @@ def run(command: GapCommand) -> None:
     known = not command.again and to_be_amended(out)  # its verdict is there and stays there
     if not command.force:
         refuse_certain(scene, given)
-    judges = given[len(command.recording) :]
-    fitted = given[: len(command.recording)]
     split, roles = assigned_roles(scene, fitted, judges) if given else (Split.RECORDINGS, {})
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
@@ -194,7 +194,10 @@ def run(command: GapCommand) -> None:
         write = write_amended if written else write_gap
         if split is Split.WINDOWS:
             values = now.verdict.base.values, now.final.model.values
-            description["open_loop"] = open_loop_errors(case, roles, *values)
+            try:
+                description["open_loop"] = open_loop_errors(case, roles, *values)
+            except ValueError as error:  # the verdict does not rest on it
+                warnings.warn(f"whole motions are not replayed open loop: {error}", stacklevel=2)
         write(
             out,
             case,

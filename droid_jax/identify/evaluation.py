@@ -7,6 +7,7 @@ Nothing is fitted, filtered or whitened, so a recording may be long.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,6 +35,7 @@ from droid_jax.recordings.recording import Channel, Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 from droid_jax.simulate.engine import choose_engine
+from droid_jax.simulate.initial_state import check_weight, start_pose
 from droid_jax.simulate.repeat_starts import own_starts
 from droid_jax.storage import finite
 
@@ -80,6 +82,8 @@ def evaluate_on(
         engine: "mjx", "mujoco" (plain C), or "auto": `simulate.engine.choose_engine` chooses.
         config: how commands are replayed; None for the defaults.
 
+    Torques that hold no weight, of joints that feel one, are left out of the errors, with a warning.
+
     Raises:
         ValueError: a recording without any channel that its replay produces, or what `make_cost` refuses.
     """
@@ -93,13 +97,26 @@ def evaluate_on(
     for given in recordings:
         recording = own_starts(given, config.start)
         informative_channels(scene, [recording])
-        named = dict.fromkeys(measured_channels(scene, recording), 1.0)
+        judged = _weighable(scene, recording, config)
+        named = dict.fromkeys(measured_channels(scene, judged), 1.0)
         follows = followed(scene, recording, replace(config, channels=named))
         replay = compiled_replay(engine, scene, space, follows, effects, config.mj_step)
         rollouts, clock = in_blocks(replay, rows), replay_clock(recording, follows)
         pair = sample_of(rollouts, 0), sample_of(rollouts, 1)
-        out.append(Replayed(recording, clock, *pair, channel_errors(scene, recording, clock, *pair)))
+        out.append(Replayed(recording, clock, *pair, channel_errors(scene, judged, clock, *pair)))
     return out
+
+
+def _weighable(scene: Scene, recording: Recording, config: CompareConfig) -> Recording:
+    """The recording, without torques that its replay cannot be compared with where it has other channels."""
+    if not recording.command.size or len(measured_channels(scene, recording)) < 2:
+        return recording
+    try:
+        check_weight(scene, recording, start_pose(scene, recording, config.start))
+    except ValueError as error:
+        warnings.warn(f"torques are left out of the errors: {error}", stacklevel=3)
+        return replace(recording, channels={k: c for k, c in recording.channels.items() if k != "torque"})
+    return recording
 
 
 def evaluation_json(replays: Sequence[Replayed], fitted: Sequence[str] = ()) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from pendulum import PARAMETERS, RATE, START, TRUE, pendulum, swung, write_pendu
 from droid_jax.cost.channels import in_noise_units
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.evaluation import evaluate_on
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters, prepare
 from droid_jax.identify.search import CmaConfig
@@ -138,6 +139,23 @@ def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
     config = IdentifyConfig(beginning=3.0, search=search, refine=still, samples=0, checks=False)
     found = identify_parameters(scene, space, [log], config=config, effects=effects)
     assert found.best == pytest.approx([*TRUE.values(), 1 / 16.0], rel=0.05)
+
+
+def test_torques_that_hold_no_weight_are_left_out_of_an_evaluation(logs: SimpleNamespace):
+    """They cannot be compared where the joint feels a weight; the positions beside them can."""
+    scene = pendulum()
+    space = load_parameters(logs.folder / "parameters.json", scene)
+    both = swung("both", 1.0, 0.8, ("torque", "position"))
+    light = replace(both, torque=replace(both.torque, gravity=False))
+    of = {"before": space.mean, "after": space.mean, "engine": "mujoco"}
+    (whole,) = evaluate_on(scene, space, both, **of)
+    with pytest.warns(UserWarning, match="torques are left out of the errors: .* holds no weight"):
+        (found,) = evaluate_on(scene, space, light, **of)
+    assert set(whole.errors) == {"torque", "position"} and set(found.errors) == {"position"}
+    assert found.errors["position"] == whole.errors["position"] and found.recording.sha256 == light.sha256
+    alone = replace(light, channels={"torque": light.channels["torque"]})
+    with pytest.raises(ValueError, match="says that its torque holds no weight"):
+        evaluate_on(scene, space, alone, **of)
 
 
 def test_the_tests_pendulum_is_another_than_the_scenes():
