@@ -335,14 +335,14 @@ def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
 
 
 def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
-    """Whether two drives have the same gains and start at one place, but for `alike`; motions, which are followed as
-    they are, never do.
+    """Whether two drives have the same gains and known values and start at one place, but for `alike`; motions, which
+    are followed as they are, never do.
 
     An object that stands ajar by about `ajar` is put back for some repeats and not for others.
     """
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
-    if not np.array_equal(servo_factors(scene, new), servo_factors(scene, old)):
+    if new.known != old.known or not np.array_equal(servo_factors(scene, new), servo_factors(scene, old)):
         return False
     apart = np.full(scene.model.nq, config.alike)
     if scene.object_joint and scene.object_joint not in scene.joints:

@@ -246,6 +246,7 @@ def motion_recording(scene: Scene, recording: Recording, addition: Addition, nam
         torque=recording.torque,
         qpos0=qpos0,
         gains=recording.gains,
+        known=recording.known,
     )
 
 

@@ -103,7 +103,8 @@ def check_solution(
     for number, (comparison, drive, recording, rollout) in enumerate(parts):
         if isinstance(drive, Drive):
             own = jax.tree.map(lambda a: a[0], rollout)
-            replayed = _Replayed(cost, comparison, drive, recording, best, tuple(effects), own)
+            here = cost.space.with_known(drive.known, best)
+            replayed = _Replayed(cost, comparison, drive, recording, here, tuple(effects), own)
             found[comparison.name], limit, again = replayed.checked(engine, may_compile=not compiled)
             compiled = compiled or again
             if limit is not None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -353,6 +353,21 @@ class Space:
         """[P, D] the vector `values` [D] (default: the means) with the entries of `part` replaced by rows [P, F]."""
         out = np.tile(self.mean if values is None else values, (len(rows), 1))
         out[:, self.columns(part)] = np.asarray(rows)
+        return out
+
+    def with_known(self, known: Mapping[str, float], values: Any) -> Any:
+        """Rows [..., D] with what is known of some parameters in their place.
+
+        Raises ValueError for an unknown name, or a value outside the parameter's bounds.
+        """
+        if not known:
+            return values
+        out = np.array(values)
+        for of, value in known.items():
+            p = self[of]
+            if not p.low <= value <= p.high:
+                raise ValueError(f"{of!r} is said to be {value:g} {p.unit}, outside its bounds [{p.low}, {p.high}]")
+            out[..., self.index(of)] = value
         return out
 
     def check(self, values: np.ndarray) -> np.ndarray:

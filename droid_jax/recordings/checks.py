@@ -58,6 +58,8 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     _check_clocks_meet(recording, where)
     for joint, q in recording.qpos0.items():
         number(q, f"{where}: qpos0 of joint {joint!r}")
+    for parameter, value in recording.known.items():
+        number(value, f"{where}: known value of {parameter!r}")
     _check_phases(recording, where)
     if recording.gains is not None:
         _check_gains(recording.gains, recording.command_names, where)
@@ -94,6 +96,7 @@ def _check_types(recording: Recording, where: str) -> None:
     for what, mapping, mapped in (
         ("channels", recording.channels, "names to channels"),
         ("qpos0", recording.qpos0, "joint names to positions"),
+        ("known", recording.known, "parameter names to values"),
         ("meta", recording.meta, "texts to texts"),
     ):
         if not isinstance(mapping, Mapping):
@@ -111,6 +114,8 @@ def _check_texts(recording: Recording, where: str) -> None:
     """ValueError for a text that cannot be printed or is too long: page and tables hold all of them."""
     for joint in recording.qpos0:
         name(joint, f"{where}: a joint of qpos0")
+    for parameter in recording.known:
+        name(parameter, f"{where}: a parameter of known")
     for key, channel in recording.channels.items():
         name(key, f"{where}: a channel's name")
         name(channel.unit, f"{where}, channel {key!r}: unit", empty=True)

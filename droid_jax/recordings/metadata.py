@@ -37,6 +37,7 @@ class Metadata:
     torque: TorqueConvention
     qpos0: dict[str, float]
     gains: ServoGains | None
+    known: dict[str, float]
     phases: tuple[Phase, ...]
     object_pose: ObjectPose | None
     meta: dict[str, str]
@@ -80,6 +81,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     command_names: list[str] = []
     qpos0: dict[str, float] = {}
     gains: _Gains | None = None
+    known: dict[str, float] = {}
     phases: list[_Phase] = []
     object_pose: _Pose | None = None
     meta: dict[str, str | float | bool | None] = {}
@@ -101,6 +103,8 @@ def metadata_to_json(recording: Recording) -> str:
     }
     if gains is not None:
         meta["gains"] = {"stiffness": _floats(gains.stiffness), "damping": _floats(gains.damping)}
+    if recording.known:
+        meta["known"] = {parameter: float(value) for parameter, value in recording.known.items()}
     if pose is not None:
         meta["object_pose"] = {
             "position": _floats(pose.position),
@@ -132,6 +136,7 @@ def metadata_from_json(text: str, where: str) -> Metadata:
         torque=TorqueConvention(file.torque.side, file.torque.gravity),
         qpos0=file.qpos0,
         gains=None if file.gains is None else ServoGains(_array(file.gains.stiffness), _array(file.gains.damping)),
+        known=file.known,
         phases=tuple(Phase(p.name, p.start, p.end) for p in file.phases),
         object_pose=None if file.object_pose is None else _pose(file.object_pose, where),
         meta={key: str(value) for key, value in file.meta.items()},
@@ -166,6 +171,7 @@ def recording_of(
         torque=meta.torque,
         qpos0=meta.qpos0,
         gains=meta.gains,
+        known=meta.known,
         phases=meta.phases,
         object_pose=meta.object_pose,
         meta=meta.meta,

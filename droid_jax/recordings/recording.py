@@ -117,6 +117,8 @@ class Recording:
         qpos0: joint name -> position at the start, rad or m; joints not named start where they were first
             measured, else at their first command, else where the scene has them.
         gains: servo gains, when known.
+        known: parameter name -> its value in this recording, in the parameter's unit, where a set-up differs in what
+            is known (a payload that was weighed): the replay takes it whatever is fitted.
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.
         meta: free notes; not part of the content hash.
@@ -130,6 +132,7 @@ class Recording:
     torque: TorqueConvention
     qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
+    known: Mapping[str, float] = field(default_factory=dict[str, float])
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
     meta: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -327,6 +330,8 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
         if pose is None
         else [_numbers(a) for a in (pose.position, pose.quaternion, pose.covariance)],
     }
+    if recording.known:  # absent in recordings from before there was such a thing
+        head["known"] = {parameter: float(value) for parameter, value in recording.known.items()}
 
     def arrays() -> Iterator[np.ndarray]:
         yield recording.time.astype("<f8")

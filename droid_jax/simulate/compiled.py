@@ -73,11 +73,13 @@ class Along:
 
     compiled: Callable[..., Rollout]
     scene: Scene
+    space: Space
     motion: Motion
     torques: Callable[[Path], jax.Array]
 
     def __call__(self, values: np.ndarray) -> Rollout:
-        return self.compiled(values, motion_path(self.scene, self.motion))
+        known = self.space.with_known(self.motion.known, values)
+        return self.compiled(known, motion_path(self.scene, self.motion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,16 +124,18 @@ def compiled_replay(
         mj_step: step as the C engine does.
 
     Raises:
-        ValueError: a measured motion with mj_step, what plain C does not have, or gains that the scene does not have.
+        ValueError: a measured motion with mj_step, what plain C does not have, gains that the scene does not have, or
+            a known value of a parameter that the space does not have or bounds.
     """
+    space.with_known(follows.known, space.mean)  # refused here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
         if mj_step:
             raise ValueError("mj_step replays commands; this recording has none")
         program = _inverse_program if engine == "mjx" else _inverse_in_c
         batch, torques = program(scene, layout, effects, follows.torque, follows.joints)
-        means = jnp.asarray(space.mean, jnp.float32)
-        return Along(batch, scene, follows, lambda paths: torques(means, paths))
+        means = jnp.asarray(space.with_known(follows.known, space.mean), jnp.float32)
+        return Along(batch, scene, space, follows, lambda paths: torques(means, paths))
     check_gains(scene, follows)
     if engine == "mjx":
         program = _servo_program(scene, layout, effects, Clocked(follows.timestep, follows.torque, follows), mj_step)
@@ -142,14 +146,19 @@ def compiled_replay(
             table, start, gains = traced_part(scene, drive)
             padding = jnp.repeat(table[-1:], capacity(steps) - steps, axis=0)
             of_drive = jnp.concatenate([table, padding]), start, gains, jnp.int32(steps)
-            return lambda values: sense(values, program(values, *of_drive))
+
+            def replay(values: np.ndarray) -> Rollout:
+                values = space.with_known(drive.known, values)
+                return sense(values, program(values, *of_drive))
+
+            return replay
 
         return Driven(driven, follows)
     known = [e for e in effects if e.name != TORQUE_OFFSETS]
 
     def in_c(drive: Drive) -> Batch:
         checked = _of_bodies(scene, space, c_replay(scene, space, drive, known, late=0.0 if mj_step else 0.5))
-        return lambda values: jax.tree.map(_single, checked(values))
+        return lambda values: jax.tree.map(_single, checked(space.with_known(drive.known, values)))
 
     return Driven(in_c, follows)
 

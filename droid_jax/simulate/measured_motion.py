@@ -31,6 +31,7 @@ class Motion:
     measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
     torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
     interval of its friction, because measured torque and acceleration are noisy; None: not at all.
+    known: parameter -> its value in this recording, whatever a row of values says (`Recording.known`).
     """
 
     joints: tuple[str, ...]
@@ -44,6 +45,7 @@ class Motion:
     measured: np.ndarray | None = None
     torque_slack: np.ndarray | None = None
     acceleration_slack: np.ndarray | None = None
+    known: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def timestep(self) -> float:
@@ -117,6 +119,7 @@ def measured_motion(
         measured=torque,
         torque_slack=config.tolerance * noise,
         acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
+        known=dict(recording.known),
     )
 
 

@@ -7,8 +7,8 @@ ONE sample; `simulate.batching` makes a compiled, sharded batch of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -56,6 +56,7 @@ class Drive:
     torque:  convention of the measured torque.
     stiffness, damping: [U] servo gains stated by the recording, or None: the scene's own.
     sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
+    known: parameter -> its value in this recording, whatever a row of values says (`Recording.known`).
     """
 
     command: np.ndarray
@@ -65,6 +66,7 @@ class Drive:
     stiffness: np.ndarray | None = None
     damping: np.ndarray | None = None
     sent: np.ndarray | None = None
+    known: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def time(self) -> np.ndarray:
@@ -114,6 +116,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
         stiffness=stiffness,
         damping=damping,
         sent=columns >= 0,
+        known=dict(recording.known),
     )
 
 

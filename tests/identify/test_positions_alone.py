@@ -8,20 +8,24 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pendulum as made
 import pytest
-from pendulum import PARAMETERS, RATE, START, TRUE, pendulum, swung, write_pendulum
+from pendulum import MJCF, PARAMETERS, RATE, START, TRUE, pendulum, swung, write_pendulum
 
 from droid_jax.cost.channels import in_noise_units
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
+from droid_jax.cost.windowed_log import WindowedLog, windowed_log
 from droid_jax.identify.evaluation import evaluate_on
 from droid_jax.identify.multistart import RefineConfig
-from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters, prepare
+from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify_parameters, prepare
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.recordings.formats import save_recording
+from droid_jax.recordings.recording import Recording
 from droid_jax.run import main
+from droid_jax.simulate.windows import WindowConfig
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +126,74 @@ def test_several_channels_count_in_units_of_their_noise(logs: SimpleNamespace):
     (start,) = alone.comparisons
     left = alone.smoothed(space.mean[None])[0][0] - start.channel("torque").noise.mean
     assert in_noise_units(alone, space.mean)["torque"] == pytest.approx(1 / np.sqrt(np.mean(left**2)), rel=1e-3)
+
+
+PAYLOAD = '<body name="payload" pos="0 0 -0.2"><inertial pos="0 0 0" mass="{}" diaginertia="1e-9 1e-9 1e-9"/></body>'
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A pendulum with a body for a payload, its parameters, and logs of it empty and with 0.3 kg."""
+    logs = list[Recording]()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, mass, frequency in (("empty", 1e-6, 0.8), ("loaded", 0.3, 1.1)):
+            patch.setattr(made, "MJCF", MJCF.replace("</body>", PAYLOAD.format(mass) + "</body>"))
+            logs.append(replace(swung(name, 1.0, frequency), known={"payload": mass}))
+        patch.setattr(made, "MJCF", MJCF.replace("</body>", PAYLOAD.format(1e-6) + "</body>"))
+        scene = pendulum()
+    entry = {
+        "field": "body_mass",
+        "element": "payload",
+        "name": "payload",
+        "mean": 0.1,
+        "std": 0.1,
+        "low": 0.0,
+        "high": 1.0,
+    }
+    file = tmp_path_factory.mktemp("loaded") / "parameters.json"
+    file.write_text(json.dumps([*PARAMETERS, entry | {"low": 0.0}]))
+    return SimpleNamespace(scene=scene, space=load_parameters(file, scene), logs=logs)
+
+
+def test_a_payload_that_is_known_of_each_log_is_taken_from_there(loaded: SimpleNamespace):
+    """Without it one mass is fitted to both, which leaves much of the loaded one."""
+
+    def fitted(logs: list[Recording]) -> Identified:
+        search, still = CmaConfig(generations=2, population=4, parents=None), RefineConfig(basin_hops=0)
+        config = IdentifyConfig(engine="mujoco", search=search, refine=still, samples=0, checks=False)
+        return identify_parameters(loaded.scene, loaded.space, logs, config=config)
+
+    found, pooled = fitted(loaded.logs), fitted([replace(log, known={}) for log in loaded.logs])
+    assert found.best[0] == pytest.approx(TRUE["damping"], rel=0.03)
+    assert found.best[1] == pytest.approx(TRUE["armature"], abs=6e-4)  # plain C's time step adds 4e-4 of inertia
+    assert found.heldout_distances["loaded"].after < 2e-3 < 2e-2 < pooled.heldout_distances["loaded"].after
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_windows_and_whole_motions_take_what_is_known_of_their_log(loaded: SimpleNamespace, whole: bool):
+    def made_of(logs: list[Recording]) -> WindowedLog:
+        config = CompareConfig(channels={"position": 1.0})
+        return windowed_log(loaded.scene, loaded.space, logs, config, WindowConfig(), whole=whole)
+
+    def off(rows: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.mean((rows - cost.measured) ** 2, axis=(1, 2)))
+
+    cost, best = made_of(loaded.logs), loaded.space.values(TRUE)
+    rows = np.stack([best, [*best[:2], 0.9]])
+    simulated, without = cost.simulated(rows), made_of([replace(log, known={}) for log in loaded.logs]).simulated(rows)
+    np.testing.assert_array_equal(*simulated)
+    assert (3 * off(simulated) < off(without)).all()
+    (one, _), (other, _) = (cost.about(row).spreads for row in rows)
+    np.testing.assert_array_equal(one, other)
+
+
+def test_what_is_known_must_be_a_parameter_within_its_bounds(loaded: SimpleNamespace):
+    log = loaded.logs[0]
+    for known, said in (({"load": 1.0}, "unknown parameter 'load'"), ({"payload": 3.0}, "outside its bounds")):
+        with pytest.raises(ValueError, match=said):
+            make_cost(loaded.scene, loaded.space, replace(log, known=known), engine="mujoco")
+    with pytest.raises(ValueError, match="known value of 'payload'"):
+        make_cost(loaded.scene, loaded.space, replace(log, known={"payload": np.nan}), engine="mujoco")
 
 
 def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
