@@ -214,11 +214,22 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
     late = Role.TIME_OFFSET.in_theta()
     sensed = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
     read = {late, *sensed, *(p.name for e in effects for p in e.parameters)}
-    unread = [p.name for p in space.parameters if not p.writes and p.name not in read]
+    own = [p for p in space.parameters if not p.writes and p.role is not Role.STANDS_FOR]
+    unread = [p.name for p in own if p.name not in read]
     if unread and all(e.parameters for e in effects):
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
             f"that it reads: {late}, {', '.join(sensed)}, and those of the effects that it is given"
+        )
+
+
+def check_known(space: Space, recordings: Sequence[Recording]) -> None:
+    """Raise ValueError for parameters that stand for others where no recording says so: they would change nothing."""
+    named = {value for recording in recordings for value in recording.known.values()}
+    if idle := [p.name for p in space.parameters if p.role is Role.STANDS_FOR and p.name not in named]:
+        raise ValueError(
+            f"parameters {', '.join(idle)} stand for others in recordings that say so, and none does: state it there "
+            f"(`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
         )
 
 

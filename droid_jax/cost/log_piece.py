@@ -41,7 +41,7 @@ class Piece:
     1 or C of [K, T].  columns: by channel [C] of the simulated one.
     measured: [W, K, all C].  at: [W, K] s, the instants on the recording's clock.  rows: [W, K] of the replay, nearest.
     unit: [W, K] window, or stretch of a whole motion, that an instant is in.
-    known: [D] values that hold in this recording, whatever a row says; NaN where none does.
+    stated: rows [..., D] with what is known in this recording in place (`Space.with_known`).
     """
 
     name: str
@@ -54,7 +54,7 @@ class Piece:
     at: np.ndarray
     rows: np.ndarray
     unit: np.ndarray
-    known: np.ndarray
+    stated: Callable[[np.ndarray], np.ndarray]
 
     @property
     def count(self) -> int:
@@ -103,7 +103,7 @@ class Piece:
         columns = 2 * dofs
         which = np.repeat(np.arange(self.count), columns)
         step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # one row for each column
-        rows = np.repeat(_stated(self.known, values)[None], len(which), axis=0)
+        rows = np.repeat(self.stated(values)[None], len(which), axis=0)
         ends = list[np.ndarray]()
         for s in (1.0, -1.0):
             start, speed = windows.start[which] + s * step[:, :dofs], windows.speed[which] + s * step[:, dofs:]
@@ -153,7 +153,9 @@ def _together(
     names = ("table", "start", "gains", "speed", "begin")
     given = [np.concatenate([getattr(p.windows, name) for p in pieces])[first[piece] + window] for name in names]
     parts = list[list[dict[str, np.ndarray]]]([] for _ in pieces)
-    rows = _stated(np.stack([p.known for p in pieces])[piece], np.repeat(values, each, axis=0))
+    rows = np.repeat(values, each, axis=0)
+    for i, one in enumerate(pieces):
+        rows[piece == i] = one.stated(rows[piece == i])
     for rollout, of in _blocks(pieces[0].program, rows, given, each):
         for i in np.unique(piece[of]).tolist():
             mine = piece[of] == i
@@ -165,11 +167,6 @@ def _together(
         else {}
         for part, w in zip(parts, chosen, strict=True)
     ]
-
-
-def _stated(known: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows [..., D] with known values in their place."""
-    return np.where(np.isnan(known), rows, known)
 
 
 def _blocks(
@@ -220,8 +217,9 @@ def in_windows(
     kernels = {key: _dense(each)[kept] for key, each in passed.items()}
     unit = np.repeat(np.arange(len(at))[:, None], at.shape[1], axis=1)
     cut_to = (a[kept] for a in (values, at, _nearest(at, clocks, drive), unit))
-    known = space.with_known(drive.known, np.full(len(space), np.nan))
-    return Piece(_name(recording, repeat), made.kept(kept), program, kernels, {}, columns, *cut_to, known)
+    stated = functools.partial(space.with_known, drive.known)
+    stated(space.mean)  # refused here, not at the first call
+    return Piece(_name(recording, repeat), made.kept(kept), program, kernels, {}, columns, *cut_to, stated)
 
 
 def as_a_whole(
@@ -265,8 +263,9 @@ def as_a_whole(
     )  # fmt: skip
     program = window_program(scene, space, drive, effects, 0, steps)
     cut_to = (a[:, kept] for a in (values, at, _nearest(at, clocks, drive), unit))
-    known = space.with_known(drive.known, np.full(len(space), np.nan))
-    return Piece(_name(recording, repeat), motion, program, {}, filters, columns, *cut_to, known)
+    stated = functools.partial(space.with_known, drive.known)
+    stated(space.mean)  # refused here, not at the first call
+    return Piece(_name(recording, repeat), motion, program, {}, filters, columns, *cut_to, stated)
 
 
 def _measured(

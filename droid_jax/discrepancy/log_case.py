@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from droid_jax.cost.cost import check_known
 from droid_jax.cost.lone_log import LoneLog, lone_log
 from droid_jax.cost.noise import stated_deviation
 from droid_jax.cost.windowed_log import WindowedLog, windowed_log
@@ -285,6 +286,7 @@ def case_of(
     Sensors' gains and encoders' offsets that the base has as parameters are not tested there.
     Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
     """
+    check_known(base, tuple(roles.values()))
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
     if split is Split.WINDOWS:
         return windowed_case(

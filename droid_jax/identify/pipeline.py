@@ -14,7 +14,7 @@ import numpy as np
 
 from droid_jax.arguments import check_fields, flag, instance, number, one_of, optional, several, whole
 from droid_jax.cost.channels import SIMULATED, check_channels, chosen_channels, in_noise_units
-from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.cost import Cost, check_known, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts, with_acting
@@ -255,6 +255,7 @@ def prepare(
     if config.engine == "auto":
         rows = config.search.population * config.search.restarts
         engine = choose_engine(scene, full, [*recordings, *judges], effects, rows)
+    check_known(full, [*recordings, *judges])
     base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
     _check_start(base, full)
     if len(chosen) > 1:

@@ -32,6 +32,10 @@ A list of elements (of joints, for "servo" and "motor") or of columns makes one 
 
 With "each" it makes one for each element, "rotor_shoulder" and "rotor_elbow".
 
+    {"like": "rotor", "name": "second rotor"}
+
+A parameter of the same bounds and prior that stands for another one in recordings that say so (`Recording.known`).
+
     {"inertia": "forearm", "std": 0.1}
 
 The whole inertia of a body, ten parameters that are a possible body at every value (model/inertia.py).
@@ -67,7 +71,8 @@ from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
 _KINDS = ("field", "sensor", "servo", "motor")  # of entries of one parameter
-_INERTIA = "inertia"
+_INERTIA, _LIKE = "inertia", "like"
+_OF_LIKE = (_LIKE, "name", "std", "high", "low", "mean", "nuisance", "group")
 _OF_INERTIA = (_INERTIA, "std", "high", "nuisance", "group")
 _NEEDED = ("element", "std", "high")
 _TIME = Role.TIME_OFFSET.value
@@ -82,6 +87,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
     servo: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     motor: str | msgspec.UnsetType = msgspec.UNSET
     inertia: str | msgspec.UnsetType = msgspec.UNSET
+    like: str | msgspec.UnsetType = msgspec.UNSET
     element: str | list[str] | msgspec.UnsetType = msgspec.UNSET
     name: str | msgspec.UnsetType = msgspec.UNSET
     unit: str | msgspec.UnsetType = msgspec.UNSET
@@ -119,7 +125,10 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
     """
     entries, first = _entries(path_of(path, "the path of a parameter file")), dict[str, int]()
     instance(scene, "scene", Scene)
-    parameters = [(i, p) for i, entry in enumerate(entries, 1) for p in _parameters(scene, entry, f"{path}, entry {i}")]
+    parameters = list[tuple[int, Parameter]]()
+    for i, entry in enumerate(entries, 1):
+        before = {p.name: p for _, p in parameters}
+        parameters += [(i, p) for p in _parameters(scene, entry, f"{path}, entry {i}", before)]
     for i, p in parameters:
         if first.setdefault(p.name, i) != i:
             raise ValueError(f'{path}, entry {i}: {p.name!r} is entry {first[p.name]} already; give it a unique "name"')
@@ -155,14 +164,14 @@ def _entries(path: Path) -> list[Any]:
     return cast(list[Any], content)
 
 
-def _parameters(scene: Scene, given: Any, where: str) -> Sequence[Parameter]:
-    """Those of an entry."""
+def _parameters(scene: Scene, given: Any, where: str, before: Mapping[str, Parameter]) -> Sequence[Parameter]:
+    """Those of an entry; before: those of the entries before it."""
     if not isinstance(given, dict):
         raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
     entry = cast(dict[str, Any], given)
     missing = [k for k in _needed(entry) if k not in entry]
-    if sum(kind in entry for kind in (*_KINDS, _INERTIA)) != 1:
-        missing.insert(0, "one of field, sensor, servo, motor and inertia")
+    if sum(kind in entry for kind in (*_KINDS, _INERTIA, _LIKE)) != 1:
+        missing.insert(0, "one of field, sensor, servo, motor, inertia and like")
     unknown = [k for k in entry if k not in _KNOWN]
     if wrong := faults({"missing": missing, "unknown": unknown}):
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
@@ -173,13 +182,24 @@ def _parameters(scene: Scene, given: Any, where: str) -> Sequence[Parameter]:
     try:
         if _INERTIA in options:
             return inertia_parameters(scene, options.pop(_INERTIA), **options)
+        if _LIKE in options:
+            return [_alike(before, options.pop(_LIKE), **options)]
         alone = _apart(options) if options.pop("each", False) else [options]
         return [_shared(scene, one) if _several(one) else _single(scene, one) for one in alone]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 
+def _alike(before: Mapping[str, Parameter], like: str, **options: Any) -> Parameter:
+    """A parameter that stands for one of those before it."""
+    if like not in before:
+        raise ValueError(f"no entry before it has the name {like!r}; there: {', '.join(before) or 'none'}")
+    return replace(before[like], writes=(), role=Role.STANDS_FOR, **options)
+
+
 def _needed(entry: Mapping[str, Any]) -> tuple[str, ...]:
+    if _LIKE in entry:
+        return ("name",)
     if "servo" in entry or _INERTIA in entry:
         return ("std",)
     if "motor" in entry:
@@ -256,6 +276,8 @@ def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
     if _INERTIA in entry:
         return tuple(key for key in _KNOWN if key not in (*_KINDS, *_OF_INERTIA))
+    if _LIKE in entry:
+        return tuple(key for key in _KNOWN if key not in (*_KINDS, *_OF_LIKE))
     if "servo" in entry:
         return ("element", "column", "mode")
     if "motor" in entry:

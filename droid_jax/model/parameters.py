@@ -128,6 +128,7 @@ class Role(enum.Enum):
     TORSIONAL_FRICTION = "torsional_friction"  # likewise, m
     PAYLOAD_MASS = "payload_mass"  # kg that the arm carries at its hand beside what the model says
     OBJECT_TORQUE = "object_torque"  # N m (N of a slide), constant on the object's joint
+    STANDS_FOR = "stands_for"  # another parameter, in recordings that say so (`Recording.known`)
     OTHER = "other"
 
     def in_theta(self, joint: str = "") -> str:
@@ -355,8 +356,8 @@ class Space:
         out[:, self.columns(part)] = np.asarray(rows)
         return out
 
-    def with_known(self, known: Mapping[str, float], values: Any) -> Any:
-        """Rows [..., D] with what is known of some parameters in their place.
+    def with_known(self, known: Mapping[str, float | str], values: Any) -> Any:
+        """Rows [..., D] with what is known of some parameters in their place, or what stands for them.
 
         Raises ValueError for an unknown name, or a value outside the parameter's bounds.
         """
@@ -365,6 +366,9 @@ class Space:
         out = np.array(values)
         for of, value in known.items():
             p = self[of]
+            if isinstance(value, str):
+                out[..., self.index(of)] = np.asarray(values)[..., self.index(value)]
+                continue
             if not p.low <= value <= p.high:
                 raise ValueError(f"{of!r} is said to be {value:g} {p.unit}, outside its bounds [{p.low}, {p.high}]")
             out[..., self.index(of)] = value

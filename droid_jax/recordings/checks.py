@@ -59,7 +59,8 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     for joint, q in recording.qpos0.items():
         number(q, f"{where}: qpos0 of joint {joint!r}")
     for parameter, value in recording.known.items():
-        number(value, f"{where}: known value of {parameter!r}")
+        if not isinstance(value, str):
+            number(value, f"{where}: known value of {parameter!r}")
     _check_phases(recording, where)
     if recording.gains is not None:
         _check_gains(recording.gains, recording.command_names, where)
@@ -96,7 +97,7 @@ def _check_types(recording: Recording, where: str) -> None:
     for what, mapping, mapped in (
         ("channels", recording.channels, "names to channels"),
         ("qpos0", recording.qpos0, "joint names to positions"),
-        ("known", recording.known, "parameter names to values"),
+        ("known", recording.known, "parameter names to values or names"),
         ("meta", recording.meta, "texts to texts"),
     ):
         if not isinstance(mapping, Mapping):
@@ -114,8 +115,10 @@ def _check_texts(recording: Recording, where: str) -> None:
     """ValueError for a text that cannot be printed or is too long: page and tables hold all of them."""
     for joint in recording.qpos0:
         name(joint, f"{where}: a joint of qpos0")
-    for parameter in recording.known:
+    for parameter, value in recording.known.items():
         name(parameter, f"{where}: a parameter of known")
+        if isinstance(value, str):
+            name(value, f"{where}: what stands for {parameter!r}")
     for key, channel in recording.channels.items():
         name(key, f"{where}: a channel's name")
         name(channel.unit, f"{where}, channel {key!r}: unit", empty=True)

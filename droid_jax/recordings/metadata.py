@@ -20,6 +20,7 @@ from droid_jax.recordings.recording import (
     ServoGains,
     TorqueConvention,
     TorqueSide,
+    known_values,
 )
 
 FORMAT = "droid_jax recording 1"
@@ -37,7 +38,7 @@ class Metadata:
     torque: TorqueConvention
     qpos0: dict[str, float]
     gains: ServoGains | None
-    known: dict[str, float]
+    known: dict[str, float | str]
     phases: tuple[Phase, ...]
     object_pose: ObjectPose | None
     meta: dict[str, str]
@@ -81,7 +82,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     command_names: list[str] = []
     qpos0: dict[str, float] = {}
     gains: _Gains | None = None
-    known: dict[str, float] = {}
+    known: dict[str, float | str] = {}
     phases: list[_Phase] = []
     object_pose: _Pose | None = None
     meta: dict[str, str | float | bool | None] = {}
@@ -104,7 +105,7 @@ def metadata_to_json(recording: Recording) -> str:
     if gains is not None:
         meta["gains"] = {"stiffness": _floats(gains.stiffness), "damping": _floats(gains.damping)}
     if recording.known:
-        meta["known"] = {parameter: float(value) for parameter, value in recording.known.items()}
+        meta["known"] = known_values(recording)
     if pose is not None:
         meta["object_pose"] = {
             "position": _floats(pose.position),

@@ -117,8 +117,9 @@ class Recording:
         qpos0: joint name -> position at the start, rad or m; joints not named start where they were first
             measured, else at their first command, else where the scene has them.
         gains: servo gains, when known.
-        known: parameter name -> its value in this recording, in the parameter's unit, where a set-up differs in what
-            is known (a payload that was weighed): the replay takes it whatever is fitted.
+        known: parameter name -> its value in this recording, in the parameter's unit, where set-ups differ in what is
+            known (a payload that was weighed); or the name of the parameter that stands for it here. The replay takes
+            it whatever is fitted.
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.
         meta: free notes; not part of the content hash.
@@ -132,7 +133,7 @@ class Recording:
     torque: TorqueConvention
     qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
-    known: Mapping[str, float] = field(default_factory=dict[str, float])
+    known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
     meta: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -312,6 +313,11 @@ def _interpolate(channel: Channel, repeat: int, column: int, at: float, slack: f
     return float(np.interp(at, time, values))
 
 
+def known_values(recording: Recording) -> dict[str, float | str]:
+    """`Recording.known` as plain data."""
+    return {of: value if isinstance(value, str) else float(value) for of, value in recording.known.items()}
+
+
 def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]]:
     """What the hash covers: a JSON head, and little-endian arrays in a fixed order."""
     pose, gains = recording.object_pose, recording.gains
@@ -331,7 +337,7 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
         else [_numbers(a) for a in (pose.position, pose.quaternion, pose.covariance)],
     }
     if recording.known:  # absent in recordings from before there was such a thing
-        head["known"] = {parameter: float(value) for parameter, value in recording.known.items()}
+        head["known"] = known_values(recording)
 
     def arrays() -> Iterator[np.ndarray]:
         yield recording.time.astype("<f8")

@@ -31,7 +31,7 @@ class Motion:
     measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
     torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
     interval of its friction, because measured torque and acceleration are noisy; None: not at all.
-    known: parameter -> its value in this recording, whatever a row of values says (`Recording.known`).
+    known: parameter -> its value in this recording, or what stands for it, whatever a row says (`Recording.known`).
     """
 
     joints: tuple[str, ...]
@@ -45,7 +45,7 @@ class Motion:
     measured: np.ndarray | None = None
     torque_slack: np.ndarray | None = None
     acceleration_slack: np.ndarray | None = None
-    known: Mapping[str, float] = field(default_factory=dict[str, float])
+    known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
 
     @property
     def timestep(self) -> float:

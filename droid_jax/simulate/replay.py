@@ -56,7 +56,7 @@ class Drive:
     torque:  convention of the measured torque.
     stiffness, damping: [U] servo gains stated by the recording, or None: the scene's own.
     sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
-    known: parameter -> its value in this recording, whatever a row of values says (`Recording.known`).
+    known: parameter -> its value in this recording, or what stands for it, whatever a row says (`Recording.known`).
     """
 
     command: np.ndarray
@@ -66,7 +66,7 @@ class Drive:
     stiffness: np.ndarray | None = None
     damping: np.ndarray | None = None
     sent: np.ndarray | None = None
-    known: Mapping[str, float] = field(default_factory=dict[str, float])
+    known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
 
     @property
     def time(self) -> np.ndarray:

@@ -22,6 +22,7 @@ from droid_jax.identify.pipeline import Identified, IdentifyConfig, identify_par
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.parameter_file import load_parameters
+from droid_jax.model.parameters import Role, Space
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.run import main
@@ -187,9 +188,27 @@ def test_windows_and_whole_motions_take_what_is_known_of_their_log(loaded: Simpl
     np.testing.assert_array_equal(one, other)
 
 
+def test_a_parameter_stands_for_another_in_one_recording(loaded: SimpleNamespace):
+    """What the loaded log carries is fitted, and the empty one does not; one that no log asks for is refused."""
+    empty, full = loaded.logs
+    space = Space(
+        (*loaded.space.parameters, replace(loaded.space["payload"], name="tool", writes=(), role=Role.STANDS_FOR))
+    )
+    search, still = CmaConfig(generations=2, population=4, parents=None), RefineConfig(basin_hops=0)
+    config = IdentifyConfig(engine="mujoco", search=search, refine=still, samples=0, checks=False)
+    found = identify_parameters(loaded.scene, space, [empty, replace(full, known={"payload": "tool"})], config=config)
+    assert found.best[space.index("tool")] == pytest.approx(0.3, rel=0.06)  # as above
+    with pytest.raises(ValueError, match="parameters tool stand for others in recordings that say so, and none does"):
+        prepare(loaded.scene, space, loaded.logs, config=config)
+
+
 def test_what_is_known_must_be_a_parameter_within_its_bounds(loaded: SimpleNamespace):
     log = loaded.logs[0]
-    for known, said in (({"load": 1.0}, "unknown parameter 'load'"), ({"payload": 3.0}, "outside its bounds")):
+    for known, said in (
+        ({"load": 1.0}, "unknown parameter 'load'"),
+        ({"payload": 3.0}, "outside its bounds"),
+        ({"payload": "tool"}, "unknown parameter 'tool'"),
+    ):
         with pytest.raises(ValueError, match=said):
             make_cost(loaded.scene, loaded.space, replace(log, known=known), engine="mujoco")
     with pytest.raises(ValueError, match="known value of 'payload'"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from droid_jax.model.parameter_file import friction_joints, load_parameters
-from droid_jax.model.parameters import Mode, Scaling, Space
+from droid_jax.model.parameters import Mode, Role, Scaling, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene, compile_scene
 
@@ -76,7 +76,7 @@ def test_a_servos_gain_and_the_commands_delay_have_no_element(tmp_path: Path, sc
     for entry, says in (
         ({"servo": "wrist", "std": 0.05}, "no actuator drives 'wrist'"),
         ({"servo": "elbow"}, "missing std"),
-        ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "one of field, sensor, servo, motor and inertia"),
+        ({"servo": "elbow", "sensor": "coulomb", "std": 0.05}, "one of field, sensor, servo, motor, inertia and like"),
         ({"sensor": "time_offset", "std": 0.05}, "missing high"),
         ({"sensor": "time_offset", "std": 0.05, "high": 1.0, "name": "lag"}, "leave name out"),
         ({"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5, "name": "dry"}, "leave name out"),
@@ -220,3 +220,19 @@ def test_joints_that_share_a_friction_loss_each_get_their_row(tmp_path: Path):
         json.dumps([{"field": "dof_frictionloss", "element": ["elbow", "wrist"], "std": 0.1, "high": 1.0}])
     )
     assert friction_joints(tmp_path / "parameters.json") == ("elbow", "wrist")
+
+
+def test_an_entry_like_another_stands_for_it(tmp_path: Path, scene: Scene):
+    path = tmp_path / "parameters.json"
+    path.write_text(json.dumps([{**GOOD, "name": "oil"}, {"like": "oil", "name": "old oil", "std": 0.2}]))
+    oil, old = load_parameters(path, scene).parameters
+    assert (old.unit, old.low, old.high, old.mean) == (oil.unit, oil.low, oil.high, oil.mean)
+    assert (old.std, old.writes, old.role) == (0.2, (), Role.STANDS_FOR) and oil.writes
+    for entry, said in (
+        ({"like": "grease", "name": "old"}, "no entry before it has the name 'grease'; there: oil"),
+        ({"like": "oil"}, "missing name"),
+        ({"like": "oil", "name": "old", "column": 1}, "leave column out"),
+    ):
+        path.write_text(json.dumps([{**GOOD, "name": "oil"}, entry]))
+        with pytest.raises(ValueError, match=f"entry 2: {said}"):
+            load_parameters(path, scene)

@@ -54,7 +54,7 @@ def make(dtype=np.float64) -> Recording:
         torque=TorqueConvention(TorqueSide.LINK, gravity=True),
         qpos0={"j1": 0.1, "j2": 1 / 3},
         gains=ServoGains(np.array([600.0, 250.0]), np.array([50.0, 15.0])),
-        known={"payload": 0.25},
+        known={"payload": 0.25, "rotor": "second rotor"},
         phases=(Phase("opening", 0.05, 0.1),),
         object_pose=ObjectPose(np.array([0.5, 0, 0.3]), np.array([1.0, 0, 0, 0]), np.diag([1e-6] * 6)),
         meta={"robot": "panda", "note": "Tür"},
