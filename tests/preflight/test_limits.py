@@ -11,7 +11,7 @@ import pytest
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.creep import STIFF, creep_note, creep_per_load, creeping
 from droid_jax.preflight.preflight import clipped_commands, command_notes, exceeded_torques
-from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
 TIME = np.arange(0.0, 10.0, 0.01)
 HINGE = """<mujoco><option integrator="implicitfast" timestep="0.002" {option}/><worldbody>
@@ -145,6 +145,15 @@ def test_creep_is_said_where_it_is_visible_alone():
     soft = hinge('frictionloss="0.3"', actuator='<position joint="j" kp="5" kv="1"/>')
     found = creeping(soft, log(held, np.where(TIME < 4.0, 0.0, 0.2), np.where(TIME < 4.0, 0.0, 0.26)))
     assert found and found[0].distance <= 0.3 / 5.0
+
+
+def test_a_servo_creeps_by_the_gain_that_the_recording_states():
+    """The scene's stiff servo was taken, which creeps too little to be seen."""
+    scene = hinge('frictionloss="0.3"', actuator='<position joint="j" kp="100" kv="1"/>')
+    held, torque = np.where(TIME < 4.0, 0.0, 0.3), np.where(TIME < 4.0, 0.0, 0.2)
+    right = log(held, torque, np.where(TIME < 4.0, 0.0, 0.26))
+    assert not creep_note(scene, right)
+    assert creep_note(scene, replace(right, gains=ServoGains(np.array([5.0]), np.array([1.0]))))
 
 
 def test_a_fit_that_finds_more_friction_creeps_more():

@@ -281,14 +281,28 @@ def test_degrees_of_positions_and_commands_without_torques():
     assert finding.kind == "units" and "are these degrees?" in finding.sentence
 
 
-@pytest.mark.parametrize("factor", [10.0, 0.1])
-def test_gains_of_another_robot_without_torques(factor: float):
+def stronger(factor: float) -> Scene:
+    """The arm with other servo gains than the robot had."""
     spec = scene().spec.copy()
     for actuator in spec.actuators:
         actuator.gainprm[0] *= factor
         actuator.biasprm[1] *= factor
-    other = compile_scene(spec, "other", joints=JOINTS)
-    (finding,) = check_log(other, positions_alone(recording(size=5 * SIZE)))
+    return compile_scene(spec, "other", joints=JOINTS)
+
+
+@pytest.mark.parametrize("factor", [200.0, 10.0])
+def test_gains_that_the_recording_states_count(factor: float):
+    """The scene's were taken, which no replay uses: right torques were found to be wrong, certainly."""
+    fine = recording(size=5 * SIZE)
+    for log in (fine, positions_alone(fine)):
+        assert check_log(stronger(factor), log) == ()
+        assert check_log(stronger(factor), replace(log, gains=None)) != ()
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1])
+def test_gains_of_another_robot_without_torques(factor: float):
+    unstated = replace(positions_alone(recording(size=5 * SIZE)), gains=None)
+    (finding,) = check_log(stronger(factor), unstated)
     assert finding.kind == "gains" and 0.5 < finding.value / factor < 2.0
     assert "are these gains the robot's?" in finding.sentence
 
