@@ -240,6 +240,38 @@ def test_a_position_that_does_not_move():
     assert ("sensor", "elbow") in found(coarse)
 
 
+TURNING = np.arange(0.0, 12.0, 0.01)
+
+
+def wheel() -> Scene:
+    xml = """<mujoco><worldbody><body><joint name="wheel" axis="0 0 1" armature="0.01" damping="1"/>
+    <geom size=".1" mass="0.1"/></body></worldbody><actuator><position joint="wheel" kp="50"/></actuator></mujoco>"""
+    return compile_scene(mujoco.MjSpec.from_string(xml), "wheel", joints=["wheel"])
+
+
+def turning(sent: np.ndarray, went: np.ndarray) -> Recording:
+    position = Channel("position", "rad", ("wheel",), TURNING, went[None, :, None], np.ones((1, len(TURNING), 1), bool))
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    return Recording("turns", TURNING, sent[:, None], ("wheel",), {"position": position}, convention)
+
+
+@pytest.mark.parametrize("what", ["position", "command"])
+def test_an_angle_that_counts_within_one_turn(what: str):
+    """The position was said to run against its command, with the wrong sign."""
+    signals = {"command": np.pi + 0.3 * np.sin(2 * np.pi * 0.2 * TURNING)}
+    signals["position"] = np.interp(TURNING - 0.02, TURNING, signals["command"])
+    assert not any(f.kind == "units" for f in check_log(wheel(), turning(signals["command"], signals["position"])))
+    signals[what] = (signals[what] + np.pi) % (2 * np.pi) - np.pi
+    (finding,) = check_log(wheel(), turning(signals["command"], signals["position"]))
+    assert finding.severity == "certain" and f"the {what} of wheel jumps by one turn" in finding.sentence
+
+
+def test_a_command_that_turns_once_is_no_jump_of_the_log():
+    went = 2 * np.pi * np.clip((TURNING - 5.0) / 1.0, 0.0, 1.0)
+    found = check_log(wheel(), turning(np.where(TURNING < 5.0, 0.0, 2 * np.pi), went))
+    assert not any(f.kind == "units" for f in found)
+
+
 def test_a_nominal_rate_beside_stamps():
     """Positions at 4.012 ms, commands played back at the nominal 4 ms."""
     fine = recording(seconds=60.0)
