@@ -9,14 +9,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from two_link import ARM, JOINTS, measured, motion, recording
+from two_link import ARM, JOINTS, MOTOR, arm, measured, motion, recording
 
 from benchmarks.check_cases import RATE, played
 from benchmarks.check_cases import measured as recorded_channels
-from droid_jax.identify.additions import Addition, MotionProposal
+from droid_jax.identify.additions import Addition, MotionProposal, additions, propose
+from droid_jax.identify.excitation import Excitation, ExcitationConfig, identifiability_of
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
-from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.run import main
 
 
@@ -155,6 +159,53 @@ def test_a_motion_that_is_proposed_several_times_is_said_once():
     ramp, steps = (Addition(what, "elbow", np.arange(7.0), np.zeros(7)) for what in ("a slow ramp", "steps"))
     proposal = MotionProposal((ramp, steps, ramp), (), ("mass",), (), ("elbow",), np.zeros(1), 2)
     assert proposal.sentence == "To tell mass, record besides 2 times a slow ramp, steps: 18 s."
+
+
+def untold(scene: Scene) -> tuple[Space, Excitation]:
+    """Damping of the arm's joints, of which nothing is known."""
+    space = Space(tuple(joint_damping(scene, j, std=1.0, high=20.0) for j in JOINTS))
+    config, none = ExcitationConfig(), np.zeros((2, 2))
+    verdicts = identifiability_of(space, none, config.identifiability)
+    return space, Excitation(space, space.mean, none, np.ones(2), verdicts, {}, config, "mujoco", 0.0)
+
+
+def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
+    """A hand was said to hold an object in any case; a replay that failed took all that was found with it."""
+    servos = arm()
+    space, found = untold(servos)
+    spec = servos.spec.copy()
+    for actuator in spec.actuators:
+        actuator.biasprm[1] = 0.0
+    motors = compile_scene(spec, "motors", joints=JOINTS)
+    bare = wave(command=np.zeros((0, 0)), command_names=(), time=np.zeros(0), gains=None)
+    unmeasured = replace(bare, channels={"torque": bare.channels["torque"]})
+    for scene, log, why in (
+        (motors, wave(), "the commands go to no position servo"),
+        (servos, unmeasured, "no joint's position was measured where the recording begins"),
+        (replace(servos, object_joint="elbow"), wave(), "a hand holds an object"),
+    ):
+        said = propose(scene, space, found, log).sentence
+        assert said.startswith(f"Open stay {', '.join(found.open)}. No motion is proposed: {why}")
+
+    def failing(*_: object, **__: object) -> None:
+        raise ValueError("the time step is too long")
+
+    monkeypatch.setattr("droid_jax.identify.additions.make_cost", failing)
+    proposal = propose(servos, space, found, wave())
+    assert "cannot be replayed (the time step is too long)" in proposal.sentence and proposal.left == found.open
+
+
+def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing():
+    """It was sent through 90 % of its whole range."""
+    xml = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-2 2" limited="true"/>
+    <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "slide", joints=["x"])
+    time = np.arange(0.0, 5.0, 0.01)
+    values, mask = 0.05 * (1 - np.cos(time))[None, :, None], np.ones((1, len(time), 1), bool)
+    values[0, 50], mask[0, 50] = np.nan, False
+    position = Channel("position", "m", ("x",), time, values, mask)
+    log = Recording("slide", np.zeros(0), np.zeros((0, 0)), (), {"position": position}, MOTOR)
+    assert max(np.abs(a.path).max() for a in additions(scene, log)) < 0.1
 
 
 def test_bad_calls(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

@@ -55,6 +55,7 @@ class MotionProposal:
     chosen: in the order in which they were picked.  identifiability: of each parameter with them.
     opened: the names that they make identifiable.  left: those that stay open.  tried: candidates.
     joints, start: [U] of the commands, and where they begin, rad or m.
+    why: no motion was tried; empty where some were.
     """
 
     chosen: tuple[Addition, ...]
@@ -64,6 +65,7 @@ class MotionProposal:
     joints: tuple[str, ...]
     start: np.ndarray
     tried: int
+    why: str = ""
 
     @property
     def seconds(self) -> float:
@@ -76,7 +78,7 @@ class MotionProposal:
         if not self.opened and not self.left:
             return "These recordings tell all parameters."
         if not self.tried:
-            return f"Open stay {', '.join(self.left)}. No motion is proposed where a hand holds an object."
+            return f"Open stay {', '.join(self.left)}. No motion is proposed: {self.why}."
         left = f"None of the motions that were tried tells {', '.join(self.left)}" if self.left else ""
         left += ": another load, more repeats or a narrower prior may." if left else ""
         if not self.opened:
@@ -133,6 +135,18 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
     return tuple(found)
 
 
+def _why_none(scene: Scene, recording: Recording) -> str:
+    """Why `additions` has no motion."""
+    joints, _ = _start(scene, recording)
+    if scene.object_joint is not None or scene.grip is not None:
+        return "a hand holds an object, and its way is not known to be free"
+    if recording.command.size and not _servos(scene).intersection(joints):
+        return "the commands go to no position servo"
+    if not joints:
+        return "no joint's position was measured where the recording begins"
+    return "no joint has room in its range"
+
+
 def propose(
     scene: Scene, space: Space, found: Excitation, recording: Recording, candidates: Sequence[Addition] | None = None
 ) -> MotionProposal:
@@ -161,7 +175,12 @@ def propose(
         reached = np.array([t.shrinkage for t in judged(information)])[main]
         return np.log(np.maximum(reached, MARGIN * limit))
 
-    each = _information(scene, space, found, recording, candidates) if found.open and candidates else {}
+    each, why = dict[int, np.ndarray](), "" if candidates else _why_none(scene, recording)
+    if found.open and candidates:
+        try:
+            each = _information(scene, space, found, recording, candidates)
+        except ValueError as error:  # what the recording tells is known all the same
+            candidates, why = (), f"those that were tried cannot be replayed ({error})"
     while each and len(chosen) < MOST and np.any(widths(total) > np.log(limit * MARGIN)):
         before = widths(total)
         gains = {k: float(np.sum(before - widths(total + i))) for k, i in each.items()}
@@ -187,6 +206,7 @@ def propose(
         joints=joints,
         start=start,
         tried=len(candidates),
+        why=why,
     )
 
 
@@ -289,10 +309,16 @@ def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[flo
         path = (
             recording.command[:, recording.command_names.index(joint)]
             if recording.command.size
-            else recording.channels["position"].values[..., recording.channels["position"].columns.index(joint)]
+            else _measured(recording.channels["position"], joint)
         )
         unit = float(np.ptp(path))
     return max(0.0, FREE * (q - low)), max(0.0, FREE * (high - q)), unit
+
+
+def _measured(channel: Channel, joint: str) -> np.ndarray:
+    """[K] what was measured of a joint, in all repeats."""
+    i = channel.columns.index(joint)
+    return channel.values[..., i][channel.mask[..., i]]
 
 
 # Paths of -1 to 1 over a time [K], which begin and end at 0 ---------------------------------------------------
