@@ -20,7 +20,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
-from droid_jax.recordings.recording import Channel, Recording
+from droid_jax.recordings.recording import Channel, Recording, ServoGains
 from droid_jax.run import main
 
 
@@ -193,6 +193,23 @@ def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("droid_jax.identify.additions.make_cost", failing)
     proposal = propose(servos, space, found, wave())
     assert "cannot be replayed (the time step is too long)" in proposal.sentence and proposal.left == found.open
+
+
+def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
+    """The largest jump was 1.5 times what was said, and no limit was looked at."""
+
+    def jump(scene: Scene, log: Recording) -> float:
+        (steps,) = (a for a in additions(scene, log) if a.what.startswith("steps of elbow"))
+        assert f"({np.abs(np.diff(steps.path)).max():.2g} rad)" in steps.what
+        return float(np.abs(np.diff(steps.path)).max())
+
+    spec = arm().spec.copy()
+    for actuator in spec.actuators:
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-5.0, 5.0]
+    limited = compile_scene(spec, "limited", joints=JOINTS)
+    assert jump(arm(), wave()) == pytest.approx(0.3)
+    assert jump(limited, wave(gains=None)) == pytest.approx(0.5 * 5.0 / 25.0)
+    assert jump(limited, wave(gains=ServoGains(np.array([60.0, 50.0]), np.zeros(2)))) == pytest.approx(0.05)
 
 
 def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing():
