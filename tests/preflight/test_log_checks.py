@@ -209,6 +209,22 @@ def test_stamps_that_are_no_seconds_and_gaps_in_them():
     assert gap.severity == "note" and "'position' has a gap in time, the longest of 0.1 s at 5.9" in gap.sentence
 
 
+def test_slow_clocks_beside_a_usual_one_are_no_milliseconds():
+    """Set-points half a second apart, and a temperature, were said to be stamped in milliseconds, certainly."""
+    fine = recording()
+    rows = np.arange(0.0, 11.9, 0.5)
+    slow = Channel(
+        "temperature", "K", JOINTS, rows, np.ones((REPEATS, len(rows), 2)), np.ones((REPEATS, len(rows), 2), bool)
+    )
+    sparse = replace(fine, time=rows, command=fine.command[:: round(RATE / 2)][: len(rows)])
+    warm = replace(fine, channels={**fine.channels, "temperature": slow})
+    for valid in (sparse, warm):
+        assert not [f for f in check_alone(valid) if f.kind == "clock"]
+    for wrong in (replace(fine, time=1e3 * fine.time), replace(sparse, time=1e3 * rows)):
+        (finding,) = [f for f in check_alone(wrong) if f.kind == "clock"]
+        assert "the steps of the commands" in finding.sentence and "milliseconds" in finding.sentence
+
+
 @pytest.mark.parametrize("gravcomp", [False, True])
 @pytest.mark.parametrize("commands", [True, False])
 def test_weight_that_the_torque_does_not_hold_or_does(gravcomp: bool, commands: bool):
