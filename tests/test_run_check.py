@@ -82,6 +82,15 @@ def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, cap
     assert "has no commands for shoulder" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_scene_for_plain_c_alone_is_looked_at_too(tmp_path: Path, scene: Path):
+    """It was refused, and `identify --engine mujoco` takes it."""
+    scene.write_text(scene.read_text().replace("<option ", '<option cone="elliptic" '))
+    path = save_recording(wave(), tmp_path / "wave.npz")
+    out = tmp_path / "check"
+    assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(out)]) == 0
+    assert ("scene", "note") in found(out) and "--engine mujoco" in (out / "check.json").read_text()
+
+
 PARAMETERS = [
     *({"field": "dof_damping", "element": j, "unit": "N m s/rad", "std": 1.0, "high": 20.0} for j in JOINTS),
     *({"field": "dof_frictionloss", "element": j, "mean": 0.1, "std": 0.1, "high": 2.0} for j in JOINTS),
