@@ -15,6 +15,7 @@ from benchmarks.check_cases import RATE, played
 from benchmarks.check_cases import measured as recorded_channels
 from droid_jax.identify.additions import Addition, MotionProposal, additions, propose
 from droid_jax.identify.excitation import Excitation, ExcitationConfig, identifiability_of
+from droid_jax.identify.holdout import beginning
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
@@ -219,6 +220,16 @@ def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
     assert jump(arm(), wave()) == pytest.approx(0.3)
     assert jump(limited, wave(gains=None)) == pytest.approx(0.5 * 5.0 / 25.0)
     assert jump(limited, wave(gains=ServoGains(np.array([60.0, 50.0]), np.zeros(2)))) == pytest.approx(0.05)
+
+
+def test_a_beginning_that_stands_still_is_looked_at_for_longer():
+    """Of such a log the way to half of its range was left alone, and counted for all of it."""
+    time = np.arange(0.0, 60.0, 0.01)
+    went = 0.3 * np.sin(np.maximum(time - 19.0, 0.0))[:, None] * np.ones(2)
+    log = recording(time=time, command=went, channels=recording().channels)
+    assert beginning(log, 20.0).duration == pytest.approx(39.0, abs=0.05)
+    moving = recording(time=time, command=0.3 * np.sin(time)[:, None] * np.ones(2), channels=recording().channels)
+    assert beginning(moving, 20.0).duration == pytest.approx(20.0, abs=0.05)
 
 
 def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing():
