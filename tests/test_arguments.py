@@ -52,6 +52,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CompareConfig(whitened="yes"), "whitened must be True or False, got 'yes'"),  # pyright: ignore
         (lambda: CompareConfig(grip_share=1.5), "grip_share must be at most 1, got 1.5"),
         (lambda: NoiseConfig(cutoff=0.0), "cutoff must be above 0, got 0.0"),
+        (lambda: NoiseConfig(cutoff=10.0), "rate must be above twice the cutoff of 10 Hz (Nyquist), got 20 Hz"),
         (lambda: NoiseConfig(trend_repeats=2), "trend_repeats must be at least 3, got 2"),
         (lambda: NoiseConfig(minimum={"torque": 0.1}), "minimum must give each of torque, position, velocity"),
         (lambda: StartConfig(scatter=-0.1), "scatter must be at least 0, got -0.1"),
