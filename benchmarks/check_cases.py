@@ -265,6 +265,11 @@ def _exchanged(values: np.ndarray) -> np.ndarray:
     return values[..., [1, 0, *range(2, values.shape[-1])]]
 
 
+def _no_gains(r: Recording) -> Recording:
+    """The scene's gains count."""
+    return replace(r, gains=None)
+
+
 def _late(r: Recording, seconds: float) -> Recording:
     """Measurements that are stamped later than they were taken."""
     channels = {key: replace(c, time=c.time + seconds) for key, c in r.channels.items()}
@@ -474,7 +479,7 @@ ERRORS = (
     Error("saturation", ("saturation",), ("stays at",), _torque, _saturated),
     Error("copies of a repeat", ("repeats",), ("identical",), _always, lambda r: r.repeats_subset([0, 0])),
     Error("dead position", ("sensor",), ("dead", "does not move"), _always, of("position", _first_dead)),
-    Error("gains of another robot", ("gains", "units"), ("gains",), _command, lambda r: r, stronger),
+    Error("gains of another robot", ("gains", "units"), ("gains",), _command, _no_gains, stronger),
     Error("degrees in commands alone", ("units", "range"), ("degrees",), _command_in_rad, of("command", np.rad2deg)),
     Error(
         "normalised positions",

@@ -26,6 +26,7 @@ from droid_jax.model.parameters import Mode, Parameter, Scaling, Space, Write
 from droid_jax.policy.train import TrainConfig
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.initial_state import StartConfig
+from droid_jax.simulate.rest import RestConfig
 from droid_jax.synthetic.policy_trials import TransferConfig
 from droid_jax.synthetic.robot import SyntheticRobotConfig
 
@@ -52,8 +53,11 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CompareConfig(whitened="yes"), "whitened must be True or False, got 'yes'"),  # pyright: ignore
         (lambda: CompareConfig(grip_share=1.5), "grip_share must be at most 1, got 1.5"),
         (lambda: NoiseConfig(cutoff=0.0), "cutoff must be above 0, got 0.0"),
+        (lambda: NoiseConfig(cutoff=10.0), "rate must be above twice the cutoff of 10 Hz (Nyquist), got 20 Hz"),
         (lambda: NoiseConfig(trend_repeats=2), "trend_repeats must be at least 3, got 2"),
         (lambda: NoiseConfig(minimum={"torque": 0.1}), "minimum must give each of torque, position, velocity"),
+        (lambda: RestConfig(speed=-1.0), "speed must be at least 0, got -1.0"),
+        (lambda: RestConfig(stop=0.0), "stop must be above 0, got 0.0"),
         (lambda: StartConfig(scatter=-0.1), "scatter must be at least 0, got -0.1"),
         (lambda: CompareConfig(noise=8.0), "noise must be a NoiseConfig, got 8.0"),  # pyright: ignore
         (lambda: IdentifiabilityConfig(partner=1.5), "partner must be at most 1, got 1.5"),

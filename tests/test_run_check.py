@@ -9,14 +9,19 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from two_link import ARM, JOINTS, measured, motion, recording
+from two_link import ARM, JOINTS, MOTOR, arm, measured, motion, recording
 
 from benchmarks.check_cases import RATE, played
 from benchmarks.check_cases import measured as recorded_channels
-from droid_jax.identify.additions import Addition, MotionProposal
+from droid_jax.identify.additions import Addition, MotionProposal, additions, propose
+from droid_jax.identify.excitation import Excitation, ExcitationConfig, identifiability_of
+from droid_jax.identify.holdout import beginning
+from droid_jax.model.fields import joint_damping
+from droid_jax.model.parameters import Space
+from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.inspect_log import contents
 from droid_jax.recordings.formats import save_recording
-from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.recording import Channel, Recording, ServoGains
 from droid_jax.run import main
 
 
@@ -76,6 +81,15 @@ def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, cap
     path = save_recording(replace(log, channels=channels), tmp_path / "wave.npz")
     assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(tmp_path / "check")]) == 0
     assert "has no commands for shoulder" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_scene_for_plain_c_alone_is_looked_at_too(tmp_path: Path, scene: Path):
+    """It was refused, and `identify --engine mujoco` takes it."""
+    scene.write_text(scene.read_text().replace("<option ", '<option cone="elliptic" '))
+    path = save_recording(wave(), tmp_path / "wave.npz")
+    out = tmp_path / "check"
+    assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(out)]) == 0
+    assert ("scene", "note") in found(out) and "--engine mujoco" in (out / "check.json").read_text()
 
 
 PARAMETERS = [
@@ -155,6 +169,80 @@ def test_a_motion_that_is_proposed_several_times_is_said_once():
     ramp, steps = (Addition(what, "elbow", np.arange(7.0), np.zeros(7)) for what in ("a slow ramp", "steps"))
     proposal = MotionProposal((ramp, steps, ramp), (), ("mass",), (), ("elbow",), np.zeros(1), 2)
     assert proposal.sentence == "To tell mass, record besides 2 times a slow ramp, steps: 18 s."
+
+
+def untold(scene: Scene) -> tuple[Space, Excitation]:
+    """Damping of the arm's joints, of which nothing is known."""
+    space = Space(tuple(joint_damping(scene, j, std=1.0, high=20.0) for j in JOINTS))
+    config, none = ExcitationConfig(), np.zeros((2, 2))
+    verdicts = identifiability_of(space, none, config.identifiability)
+    return space, Excitation(space, space.mean, none, np.ones(2), verdicts, {}, config, "mujoco", 0.0)
+
+
+def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
+    """A hand was said to hold an object in any case; a replay that failed took all that was found with it."""
+    servos = arm()
+    space, found = untold(servos)
+    spec = servos.spec.copy()
+    for actuator in spec.actuators:
+        actuator.biasprm[1] = 0.0
+    motors = compile_scene(spec, "motors", joints=JOINTS)
+    bare = wave(command=np.zeros((0, 0)), command_names=(), time=np.zeros(0), gains=None)
+    unmeasured = replace(bare, channels={"torque": bare.channels["torque"]})
+    for scene, log, why in (
+        (motors, wave(), "the commands go to no position servo"),
+        (servos, unmeasured, "no joint's position was measured where the recording begins"),
+        (replace(servos, object_joint="elbow"), wave(), "a hand holds an object"),
+    ):
+        said = propose(scene, space, found, log).sentence
+        assert said.startswith(f"Open stay {', '.join(found.open)}. No motion is proposed: {why}")
+
+    def failing(*_: object, **__: object) -> None:
+        raise ValueError("the time step is too long")
+
+    monkeypatch.setattr("droid_jax.identify.additions.make_cost", failing)
+    proposal = propose(servos, space, found, wave())
+    assert "cannot be replayed (the time step is too long)" in proposal.sentence and proposal.left == found.open
+
+
+def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
+    """The largest jump was 1.5 times what was said, and no limit was looked at."""
+
+    def jump(scene: Scene, log: Recording) -> float:
+        (steps,) = (a for a in additions(scene, log) if a.what.startswith("steps of elbow"))
+        assert f"({np.abs(np.diff(steps.path)).max():.2g} rad)" in steps.what
+        return float(np.abs(np.diff(steps.path)).max())
+
+    spec = arm().spec.copy()
+    for actuator in spec.actuators:
+        actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-5.0, 5.0]
+    limited = compile_scene(spec, "limited", joints=JOINTS)
+    assert jump(arm(), wave()) == pytest.approx(0.3)
+    assert jump(limited, wave(gains=None)) == pytest.approx(0.5 * 5.0 / 25.0)
+    assert jump(limited, wave(gains=ServoGains(np.array([60.0, 50.0]), np.zeros(2)))) == pytest.approx(0.05)
+
+
+def test_a_beginning_that_stands_still_is_looked_at_for_longer():
+    """Of such a log the way to half of its range was left alone, and counted for all of it."""
+    time = np.arange(0.0, 60.0, 0.01)
+    went = 0.3 * np.sin(np.maximum(time - 19.0, 0.0))[:, None] * np.ones(2)
+    log = recording(time=time, command=went, channels=recording().channels)
+    assert beginning(log, 20.0).duration == pytest.approx(39.0, abs=0.05)
+    moving = recording(time=time, command=0.3 * np.sin(time)[:, None] * np.ones(2), channels=recording().channels)
+    assert beginning(moving, 20.0).duration == pytest.approx(20.0, abs=0.05)
+
+
+def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing():
+    """It was sent through 90 % of its whole range."""
+    xml = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-2 2" limited="true"/>
+    <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "slide", joints=["x"])
+    time = np.arange(0.0, 5.0, 0.01)
+    values, mask = 0.05 * (1 - np.cos(time))[None, :, None], np.ones((1, len(time), 1), bool)
+    values[0, 50], mask[0, 50] = np.nan, False
+    position = Channel("position", "m", ("x",), time, values, mask)
+    log = Recording("slide", np.zeros(0), np.zeros((0, 0)), (), {"position": position}, MOTOR)
+    assert max(np.abs(a.path).max() for a in additions(scene, log)) < 0.1
 
 
 def test_bad_calls(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

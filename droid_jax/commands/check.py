@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from droid_jax.identify.additions import MotionProposal
     from droid_jax.identify.excitation import Excitation
+    from droid_jax.model.scene import Scene
     from droid_jax.preflight.findings import Finding
     from droid_jax.preflight.inspect_log import Signal
     from droid_jax.recordings.recording import Recording
@@ -50,7 +52,6 @@ def run(command: CheckCommand) -> None:
 
     if command.parameters is not None and command.scene is not None:
         runtime.start()  # before what is imported below starts jax
-    from droid_jax.model.scene import load_scene
     from droid_jax.preflight.inspect_log import contents, inspect_log
     from droid_jax.report.check_page import check_page
     from droid_jax.storage import refuse_special, write_own
@@ -65,12 +66,8 @@ def run(command: CheckCommand) -> None:
     cutoff = compared(command.motion_cutoff).motion_cutoff
     checked = []
     for recording in recordings:
-        scene = None
-        if command.scene is not None:
-            # A log without commands may have been measured on a robot that the scene drives with nothing.
-            joints = command.joints or (() if recording.command.size else _measured(recording))
-            scene = load_scene(command.scene, joints=joints or None, object_joint=command.object_joint, hold=True)
-        checked.append((recording, contents(recording), inspect_log(recording, scene, cutoff)))
+        scene, notes = (None, ()) if command.scene is None else _scene(command.scene, command, recording)
+        checked.append((recording, contents(recording), (*inspect_log(recording, scene, cutoff), *notes)))
     for recording, tracks, findings in checked:
         _show(recording, tracks, findings)
     excited, why = None, ""
@@ -94,6 +91,27 @@ def run(command: CheckCommand) -> None:
     print(f"page: {command.out / 'check.html'}")
 
 
+def _scene(
+    path: Path, command: CheckCommand, recording: Recording, friction_joints: Sequence[str] = ()
+) -> tuple[Scene, tuple[Finding, ...]]:
+    """The scene that a recording is meant for, and what has to be known of it: that plain C alone can replay it."""
+    from droid_jax.model.scene import load_scene
+    from droid_jax.preflight.findings import Finding
+
+    # A log without commands may have been measured on a robot that the scene drives with nothing.
+    joints = command.joints or (() if recording.command.size else _measured(recording))
+    load = partial(
+        load_scene, path, joints=joints or None, object_joint=command.object_joint, friction_joints=friction_joints,
+        hold=True,
+    )  # fmt: skip
+    try:
+        return load(), ()
+    except ValueError as error:
+        scene = load(engine="mujoco")
+        note = f"only `identify --engine mujoco` takes this scene: {error}"
+        return scene, (Finding("scene", "", 0.0, 0.0, "note", note),)
+
+
 def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple[Excitation, MotionProposal] | None:
     """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
     if command.parameters is None or command.scene is None:
@@ -102,13 +120,8 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
     from droid_jax.identify.additions import propose
     from droid_jax.identify.excitation import ExcitationConfig, excitation
     from droid_jax.model.parameter_file import friction_joints, load_parameters
-    from droid_jax.model.scene import load_scene
 
-    joints = command.joints or (() if recordings[0].command.size else _measured(recordings[0]))
-    rows = friction_joints(command.parameters)
-    scene = load_scene(
-        command.scene, joints=joints or None, object_joint=command.object_joint, friction_joints=rows, hold=True
-    )
+    scene, _ = _scene(command.scene, command, recordings[0], friction_joints(command.parameters))
     space = load_parameters(command.parameters, scene)
     config = ExcitationConfig(compare=compared(command.motion_cutoff))
     found = excitation(scene, space, recordings, config)

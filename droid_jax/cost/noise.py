@@ -70,6 +70,10 @@ class NoiseConfig:
             minimum=weights,
             minimum_share=share,
         )
+        if self.rate <= 2.0 * self.cutoff:
+            raise ValueError(
+                f"rate must be above twice the cutoff of {self.cutoff:g} Hz (Nyquist), got {self.rate:g} Hz"
+            )
         if set(self.minimum) != set(_minimum()) or not all(self.minimum.values()):
             raise ValueError(
                 f"minimum must give each of {', '.join(_minimum())} a deviation above 0, got {shown(self.minimum)}"

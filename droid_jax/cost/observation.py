@@ -244,11 +244,14 @@ def _refuse_constant(channel: Channel) -> None:
         repeats = [values[mask] for values, mask in zip(channel.values[:, :, c], channel.mask[:, :, c], strict=True)]
         still = [k for k, values in enumerate(repeats) if values.size and np.ptp(values) == 0]
         if still:
-            where = "" if len(still) == len(repeats) else f" in repeat {still[0]}"
+            where, do = "", "leave the joint away (--joints, in Python load_scene(joints=...))"
+            if len(still) < len(repeats):
+                masked = len(repeats) - len(still) > 1  # one repeat alone does not tell its noise
+                where = f" in repeat {still[0]}"
+                do = f"{'mask it out there, or ' if masked else ''}leave that repeat away"
             raise ValueError(
                 f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[still[0]][0]:g} "
-                f"{channel.unit}): a dead sensor? mask it out or leave {'that repeat' if where else 'the joint'} away"
-                f"{'' if where else ' (--joints)'}"
+                f"{channel.unit}): a dead sensor? {do}"
             )
 
 

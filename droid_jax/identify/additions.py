@@ -19,14 +19,17 @@ from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.preflight.preflight import torque_range
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
+from droid_jax.simulate.servo_gains import own_stiffness, with_stated_gains
 
 SECONDS = 6.0  # of each addition
 EASE = 0.5  # s in which a chirp begins and ends
 CHIRP = (0.3, 2.0)  # Hz
 # Largest ways, rad, that a joint is sent; a slide goes as many times its own motion in the recording.
 RAMP, STEP, SWING, AWAY = 0.6, 0.3, 0.1, 0.8
+LIMIT = 0.5  # share of a servo's torque limit that a step may ask for at once
 FREE = 0.9  # share of the way to the end of a joint's range that an addition may take
 RATE = 100.0  # Hz of an addition, where a recording has no command
 MARGIN = 0.8  # of the limit of identifiability, that an addition must reach
@@ -55,6 +58,7 @@ class MotionProposal:
     chosen: in the order in which they were picked.  identifiability: of each parameter with them.
     opened: the names that they make identifiable.  left: those that stay open.  tried: candidates.
     joints, start: [U] of the commands, and where they begin, rad or m.
+    why: no motion was tried; empty where some were.
     """
 
     chosen: tuple[Addition, ...]
@@ -64,6 +68,7 @@ class MotionProposal:
     joints: tuple[str, ...]
     start: np.ndarray
     tried: int
+    why: str = ""
 
     @property
     def seconds(self) -> float:
@@ -76,7 +81,7 @@ class MotionProposal:
         if not self.opened and not self.left:
             return "These recordings tell all parameters."
         if not self.tried:
-            return f"Open stay {', '.join(self.left)}. No motion is proposed where a hand holds an object."
+            return f"Open stay {', '.join(self.left)}. No motion is proposed: {self.why}."
         left = f"None of the motions that were tried tells {', '.join(self.left)}" if self.left else ""
         left += ": another load, more repeats or a narrower prior may." if left else ""
         if not self.opened:
@@ -113,17 +118,17 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
         if max(down, up) <= 0 or (recording.command.size and joint not in _servos(scene)):
             continue
 
-        def both(share: np.ndarray, most: float, down: float = down, up: float = up, unit: float = unit) -> np.ndarray:
+        def both(share: np.ndarray, most: float, down: float = down, up: float = up) -> np.ndarray:
             """A path of -1 to 1 as far as there is room on each side."""
-            return np.where(share > 0, share * min(up, most * unit), share * min(down, most * unit))
+            return np.where(share > 0, share * min(up, most), share * min(down, most))
 
         kind = "m" if scene.slides(joint) else "rad"
         side = 1.0 if up >= down else -1.0
         for what, share, most in (
-            ("a slow ramp", _ramp(time), RAMP),
-            ("steps", jumps, STEP),
-            (f"a chirp of {CHIRP[0]:g} to {CHIRP[1]:g} Hz", _chirp(time), SWING),
-            ("a hold at another pose", side * _hold(time), AWAY),
+            ("a slow ramp", _ramp(time), unit * RAMP),
+            ("steps", jumps, min(unit * STEP, _largest_jump(scene, recording, joint))),
+            (f"a chirp of {CHIRP[0]:g} to {CHIRP[1]:g} Hz", _chirp(time), unit * SWING),
+            ("a hold at another pose", side * _hold(time), unit * AWAY),
         ):
             if share is jumps and not recording.command.size:
                 continue  # a measured path has no jumps
@@ -131,6 +136,18 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
             size = f"{np.abs(path).max():.2g} {kind}"
             found.append(Addition(f"{what} of {joint} ({size})", joint, time, q + gear * path))
     return tuple(found)
+
+
+def _why_none(scene: Scene, recording: Recording) -> str:
+    """Why `additions` has no motion."""
+    joints, _ = _start(scene, recording)
+    if scene.object_joint is not None or scene.grip is not None:
+        return "a hand holds an object, and its way is not known to be free"
+    if recording.command.size and not _servos(scene).intersection(joints):
+        return "the commands go to no position servo"
+    if not joints:
+        return "no joint's position was measured where the recording begins"
+    return "no joint has room in its range"
 
 
 def propose(
@@ -161,7 +178,12 @@ def propose(
         reached = np.array([t.shrinkage for t in judged(information)])[main]
         return np.log(np.maximum(reached, MARGIN * limit))
 
-    each = _information(scene, space, found, recording, candidates) if found.open and candidates else {}
+    each, why = dict[int, np.ndarray](), "" if candidates else _why_none(scene, recording)
+    if found.open and candidates:
+        try:
+            each = _information(scene, space, found, recording, candidates)
+        except ValueError as error:  # what the recording tells is known all the same
+            candidates, why = (), f"those that were tried cannot be replayed ({error})"
     while each and len(chosen) < MOST and np.any(widths(total) > np.log(limit * MARGIN)):
         before = widths(total)
         gains = {k: float(np.sum(before - widths(total + i))) for k, i in each.items()}
@@ -187,6 +209,7 @@ def propose(
         joints=joints,
         start=start,
         tried=len(candidates),
+        why=why,
     )
 
 
@@ -289,10 +312,25 @@ def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[flo
         path = (
             recording.command[:, recording.command_names.index(joint)]
             if recording.command.size
-            else recording.channels["position"].values[..., recording.channels["position"].columns.index(joint)]
+            else _measured(recording.channels["position"], joint)
         )
         unit = float(np.ptp(path))
     return max(0.0, FREE * (q - low)), max(0.0, FREE * (high - q)), unit
+
+
+def _largest_jump(scene: Scene, recording: Recording, joint: str) -> float:
+    """rad or m by which a servo's command may jump, lest its torque reach the limit; infinite without one."""
+    if joint not in scene.single_joints or joint not in scene.command_names:
+        return np.inf
+    u, limit = scene.command_names.index(joint), min(np.abs(torque_range(scene, joint)))
+    stiffness = own_stiffness(replace(scene, model=with_stated_gains(scene, recording)))[u]
+    return LIMIT * limit / stiffness if stiffness > 0 else np.inf
+
+
+def _measured(channel: Channel, joint: str) -> np.ndarray:
+    """[K] what was measured of a joint, in all repeats."""
+    i = channel.columns.index(joint)
+    return channel.values[..., i][channel.mask[..., i]]
 
 
 # Paths of -1 to 1 over a time [K], which begin and end at 0 ---------------------------------------------------
@@ -304,7 +342,8 @@ def _ramp(time: np.ndarray) -> np.ndarray:
 
 
 def _steps(time: np.ndarray) -> np.ndarray:
-    levels = np.array([0.0, 1.0, 0.0, -1.0, 0.5, 0.0])
+    """To each side from the middle, so that no jump is larger than the way that is said."""
+    levels = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 0.0])
     return levels[np.minimum((time / time[-1] * len(levels)).astype(int), len(levels) - 1)]
 
 

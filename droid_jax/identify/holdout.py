@@ -16,6 +16,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
 LONG = 1.5  # times the beginning that is asked for, from which on a recording is long
+STANDS = 0.01  # share of a command's range, up to which it stands still
 WORTH = 0.1  # share of the noise floor by which the distance before a fit must exceed it, unless a config says else
 NOISE_UNITS = "noise units"
 Judged = Literal["repeats", "time", "same", "recordings"]
@@ -174,11 +175,15 @@ def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
 
 
 def beginning(recording: Recording, seconds: float) -> Recording:
-    """A long commanded recording's first seconds, and more until its commands have covered half of their range."""
+    """A long commanded recording's first seconds, and more until its commands have covered half of their range.
+
+    The seconds count from where a command begins to change: a robot that stands still tells little.
+    """
     begin, end = recording.span
     if not recording.command.size or end - begin <= LONG * seconds:
         return recording
     reach = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
     moved = recording.time[int(np.argmax(np.all(reach >= 0.5 * reach[-1], axis=1)))]
-    until = max(begin + seconds, float(moved))
+    starts = recording.time[int(np.argmax(np.any(reach > STANDS * reach[-1], axis=1)))]
+    until = max(float(starts) + seconds, float(moved))
     return recording if until > begin + (end - begin) / LONG else recording.window(begin, until)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Iterable
+from dataclasses import replace
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.clocks import check_clocks, check_stamps
@@ -22,6 +23,7 @@ from droid_jax.preflight.signals import log_motion
 from droid_jax.preflight.torques import check_torque
 from droid_jax.preflight.tracking import check_tracking
 from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.servo_gains import with_stated_gains
 
 _Found = weakref.WeakKeyDictionary[Scene, tuple[Finding, ...]]
 _FOUND: weakref.WeakKeyDictionary[Recording, _Found] = weakref.WeakKeyDictionary()  # so that each is checked once
@@ -31,7 +33,8 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
     """What of a recording can hardly be right in this scene, the gravest first.
 
     Args:
-        scene: with its nominal values: masses right to a factor of three, servo gains as on the robot.
+        scene: with its nominal values: masses right to a factor of three, servo gains as on the robot. Gains that the
+            recording states count in their place, as in its replay.
         recording: a valid one (`recordings.checks.validate`).
 
     Returns:
@@ -45,9 +48,10 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
             tracking = check_tracking(scene, recording, motion)
             found += tracking
             if not tracking:  # else the torque is judged by a motion that is wrong
-                wrong = check_torque(scene, recording, motion) or check_servo_balance(scene, recording, motion)
+                replayed = replace(scene, model=with_stated_gains(scene, recording))
+                wrong = check_torque(replayed, recording, motion) or check_servo_balance(replayed, recording, motion)
                 clocks = any(f.kind == "clock" and f.severity != "note" for f in found)
-                found += wrong or ([] if clocks else check_delay(scene, recording, motion))
+                found += wrong or ([] if clocks else check_delay(replayed, recording, motion))
         known[scene] = tuple(sorted(found, key=lambda finding: ("certain", "likely", "note").index(finding.severity)))
     return known[scene]
 

@@ -8,7 +8,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.signals import log_motion
 from droid_jax.preflight.tracking import FOLLOWS, MOVES
-from droid_jax.recordings.recording import Recording
+from droid_jax.recordings.recording import JOINT_CHANNELS, Recording
 
 DRIFT = 0.03  # s by which two clocks may run apart over a recording: a delay, damping and armature hardly take more in
 NEAR = 0.05  # relative deviation within which two rates are meant to be one
@@ -18,6 +18,7 @@ WINDOW = 0.25  # share of a recording that each part has
 FEW = 10  # stamps, below which a clock's unit is not judged
 SLOWEST, QUICKEST = 0.45, 2e-5  # s between samples: stamps in ms of 2 kHz at most, or in thousands of s of 50 Hz
 GAP, LONG = 5.0, 0.03  # usual steps, and s: a longer step is a gap
+REPLAYED = (*JOINT_CHANNELS, "object_angle")  # channels that a replay produces
 RATES = ("rate", "rate_hz", "frequency", "frequency_hz", "fps", "hz")  # in `meta`
 
 
@@ -51,12 +52,18 @@ def _gaps(recording: Recording) -> list[Finding]:
 
 
 def _unit(recording: Recording) -> list[Finding]:
-    """Stamps so far apart, or so close together, that they are in no seconds."""
+    """Stamps so far apart, or so close together, that they are in no seconds.
+
+    Not those of channels that no replay produces, such as a temperature, nor those that span as long as another clock
+    of a usual rate: set-points may be far apart.
+    """
     clocks = [("the commands", recording.time)] if recording.command.size else []
-    clocks += [(f"channel {key!r}", channel.time) for key, channel in recording.channels.items()]
+    clocks += [(f"channel {key!r}", recording.channels[key].time) for key in REPLAYED if key in recording.channels]
+    usual = [time for _, time in clocks if QUICKEST <= _step(time) <= SLOWEST]
     for what, time in clocks:
-        step = float(np.median(np.diff(time))) if len(time) > FEW else 0.0
-        if step > SLOWEST or 0 < step < QUICKEST:
+        step = _step(time)
+        alike = any(0.5 < np.ptp(time) / np.ptp(other) < 2.0 for other in usual)
+        if (step > SLOWEST or 0 < step < QUICKEST) and not alike:
             unit = "milliseconds, or shorter" if step > SLOWEST else "thousands of seconds"
             return [
                 Finding(
@@ -66,6 +73,11 @@ def _unit(recording: Recording) -> list[Finding]:
                 )
             ]  # fmt: skip
     return []
+
+
+def _step(time: np.ndarray) -> float:
+    """s, the usual step of a clock; 0 of one too short to be judged."""
+    return float(np.median(np.diff(time))) if len(time) > FEW else 0.0
 
 
 def _rows(recording: Recording) -> list[Finding]:

@@ -16,6 +16,7 @@ import numpy as np
 from droid_jax.model.scene import SOFT_IMPEDANCE, TINY_FRICTIONLOSS, Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate.initial_state import sent_columns, start_pose, weight_share
+from droid_jax.simulate.servo_gains import with_stated_gains
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction with which joints hold: a thousandth of the default's creep
 HOLDS = 0.5  # s: a joint that stands still for less is turning round
@@ -69,6 +70,7 @@ def creeping(scene: Scene, recording: Recording, model: mujoco.MjModel | None = 
     numbers = scene.model if model is None else model
     if not recording.command.size or numbers.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS:
         return []
+    numbers = with_stated_gains(scene, recording, numbers)
     rubbed = [j for j in scene.joints if numbers.dof_frictionloss[scene.dof(j)] > 10 * TINY_FRICTIONLOSS]
     found = []
     qpos0 = start_pose(scene, recording) if rubbed else None

@@ -152,8 +152,10 @@ def check_range(scene: Scene, recording: Recording) -> None:
     if channel := recording.channels.get("position"):
         seen = np.where(channel.mask, channel.values, np.nan).reshape(-1, len(channel.columns))
         paths += [("is measured at", joint, seen[:, i]) for i, joint in enumerate(channel.columns)]
+    if (channel := recording.channels.get("object_angle")) and scene.object_joint is not None:
+        paths.append(("is measured at", scene.object_joint, np.where(channel.mask, channel.values, np.nan).ravel()))
     for what, joint, path in paths:
-        if joint in scene.joints and not np.isnan(path).all():
+        if joint in (*scene.joints, scene.object_joint) and not np.isnan(path).all():
             _check_reach(scene, joint, path, f"recording {recording.name!r}: {joint} {what}")
 
 

@@ -101,7 +101,7 @@ def _gains(
         return []
     joint = min(visible, key=lambda joint: abs(np.log(visible[joint][0] / size)))
     words = (
-        f"recording {recording.name!r}: the servos' torques, by their gains in the MJCF and the tracking errors, are "
+        f"recording {recording.name!r}: the servos' torques, by their gains and the tracking errors, are "
         f"about {size:.2g} times what the motion takes: are these gains the robot's?"
     )
     return [_finding("gains", joint, words, stated[joint], visible[joint][1], joint, size)]

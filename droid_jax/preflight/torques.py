@@ -397,9 +397,9 @@ def _compared(
         if degrees:
             why = "are positions and commands in degrees?"
         elif joint in right:
-            why = "are the servo's gains in the MJCF those of the robot?"
+            why = "are the servo's gains those of the robot?"
         else:
-            why = f"{_unit_words(size)} Or are the servo's gains in the MJCF others than the robot's?"
+            why = f"{_unit_words(size)} Or are the servo's gains others than the robot's?"
         words = f"{where}the torque of {joint} is {size:.2g} of {by}: {why}"
         found.append(_finding("units", joint, joint, share, scaled, words, by, value=size))
     return _register(found, list(torques))

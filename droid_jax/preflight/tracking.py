@@ -3,6 +3,8 @@ move as fast as the positions say."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -10,6 +12,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.signals import LogMotion
 from droid_jax.recordings.recording import Recording
+from droid_jax.simulate.initial_state import sent_to
 
 MOVES = 0.01  # rad or m (of both, in their own units): a joint that is sent less far tells nothing
 LATEST = 0.15  # s by which a position may lag its command; of faster swings than half of it no sign is told
@@ -22,18 +25,50 @@ RATIO = 3.0  # a servo that goes a third, or three times, as far as it is sent h
 SAME = 0.25  # relative deviation within which a ratio is that of known units
 STUCK = 1e-3  # of the way it is sent: a position that moves less does not move, or is not measured
 FASTEST = {"hinge": 30.0, "slide": 10.0}  # rad/s, m/s: no arm, leg or gripper is as fast; wheels turn one way
+TURN, NEAR = 2 * np.pi, 0.1  # rad; relative deviation within which a step is one turn
 _UNITS = {"hinge": {180 / np.pi: "degrees"}, "slide": {1000.0: "millimetres", 100.0: "centimetres"}}
 
 
 def check_tracking(scene: Scene, recording: Recording, motion: LogMotion) -> list[Finding]:
     """What is wrong with positions and commands."""
     where = f"recording {recording.name!r}"
-    joints = [j for j in motion.command if j in motion.position and np.ptp(motion.command[j]) > MOVES]
+    wrapped = _wrapped(scene, recording, motion, where)
+    paths = {j: path for j, path in motion.position.items() if j not in wrapped}
+    joints = [j for j in motion.command if j in paths and np.ptp(motion.command[j]) > MOVES]
     found = _order(motion, joints, where)
     if not found:
         for joint in joints:
             found += _of_joint(scene, motion, joint, where)
-    return found or _too_fast(scene, motion, where)
+    return [*wrapped.values(), *(found or _too_fast(scene, replace(motion, position=paths), where))]
+
+
+def _wrapped(scene: Scene, recording: Recording, motion: LogMotion, where: str) -> dict[str, Finding]:
+    """Joint -> what is said of a hinge whose measured or commanded angle begins anew after each turn."""
+    hinges = [j for j in scene.single_joints if not scene.slides(j)]
+    tracks = list[tuple[str, str, np.ndarray, np.ndarray]]()
+    if channel := recording.channels.get("position"):
+        seen = np.where(channel.mask, channel.values, np.nan)
+        tracks += [("position", j, channel.time, p) for i, j in enumerate(channel.columns) for p in seen[..., i]]
+    for joint, path in (sent_to(scene, recording) if recording.command.size else {}).items():
+        position = np.interp(recording.time, motion.time, motion.position.get(joint, np.full_like(motion.time, np.nan)))
+        if np.std(np.unwrap(path) - position) < np.std(path - position):  # else it is sent a turn further, and goes
+            tracks.append(("command", joint, recording.time, path))
+    found = dict[str, Finding]()
+    for what, joint, time, path in tracks:
+        steps = np.nan_to_num(np.abs(np.diff(path)))
+        turns = np.flatnonzero(np.abs(steps - TURN) < NEAR * TURN)
+        if joint not in hinges or not len(turns):
+            continue
+        # Degrees and counts have steps of all sizes, and with a slow clock a wheel may turn once from row to row.
+        others, longest = np.delete(steps, turns).max(initial=0.0), np.diff(time)[turns].max()
+        if others < TURN / 2 and longest < TURN / FASTEST["hinge"]:
+            at = float(time[turns[0]])
+            sentence = (
+                f"{where}: the {what} of {joint} jumps by one turn from one sample to the next, at {at:.4g} s: the log "
+                "counts within one turn; unwrap it (numpy.unwrap) before it is converted"
+            )
+            found.setdefault(joint, Finding("units", joint, float(steps[turns[0]]), 0.0, "certain", sentence))
+    return found
 
 
 def correlations(motion: LogMotion, sent: str, measured: str) -> tuple[np.ndarray, np.ndarray]:

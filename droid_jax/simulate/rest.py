@@ -13,10 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy
 
+from droid_jax.arguments import check_fields, number
 from droid_jax.recordings.recording import Recording
 
 SHORTEST = 30  # samples that the torques' low-pass pads itself with
@@ -47,6 +49,10 @@ class RestConfig:
     stop: float = 1.5
     settle: float = 2.0
     tolerance: float = 3.0
+
+    def __post_init__(self) -> None:
+        fields = ("speed", "noise", "share", "settle", "tolerance")
+        check_fields(self, **dict.fromkeys(fields, partial(number, least=0)), stop=partial(number, above=0))
 
 
 def at_rest(

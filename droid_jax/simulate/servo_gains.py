@@ -6,6 +6,7 @@ differ in their gains alone compile nothing again, and a parameter that scales a
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -56,8 +57,13 @@ def servo_factors(scene: Scene, drive: Drive) -> np.ndarray:
 
     A velocity gain that the scene's servo does not have stays absent: its damping is the joint's.
     """
+    return _factors(scene, drive.stiffness, drive.damping)
+
+
+def _factors(scene: Scene, stiffness: np.ndarray | None, damping: np.ndarray | None) -> np.ndarray:
+    """[U, 2] the same of stated gains [U], None where none are stated."""
     servos = position_servos(scene.model)
-    pairs = ((drive.stiffness, own_stiffness(scene)), (drive.damping, own_damping(scene)))
+    pairs = ((stiffness, own_stiffness(scene)), (damping, own_damping(scene)))
     return np.stack([_ratio(stated, own, servos) for stated, own in pairs], axis=1)
 
 
@@ -98,6 +104,17 @@ def stated_gains(scene: Scene, recording: Recording) -> tuple[np.ndarray, np.nda
     stiffness[sent] = np.asarray(recording.gains.stiffness, dtype=float)[columns[sent]]
     damping[sent] = np.asarray(recording.gains.damping, dtype=float)[columns[sent]]
     return stiffness, damping
+
+
+def with_stated_gains(scene: Scene, recording: Recording, model: mujoco.MjModel | None = None) -> mujoco.MjModel:
+    """The scene's model with the gains of a recording's replay: those that it states, else the scene's.
+
+    model: the scene's with other numbers, in its place.  Raises ValueError as `stated_gains` does.
+    """
+    numbers = scene.model if model is None else model
+    if not recording.command.size or (stated := stated_gains(scene, recording)) is None:
+        return numbers
+    return scale_gains(copy.copy(numbers), _factors(scene, *stated))
 
 
 def gains_note(scene: Scene, recording: Recording) -> str:

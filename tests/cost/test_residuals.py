@@ -437,6 +437,20 @@ def test_a_dead_channel_is_refused(scene: Scene):
         compare(scene, recording(channel("torque", CLOCK, values)))
 
 
+@pytest.mark.parametrize(("repeats", "dead", "do"), [(3, 3, "leave the joint away"), (3, 1, "mask it out there, or le"),
+                                                     (2, 1, "leave that repeat away")])  # fmt: skip
+def test_what_is_advised_of_a_dead_column_works(scene: Scene, repeats: int, dead: int, do: str):
+    """Masking was advised where it leaves no repeat, or one, that measured the column, which is refused in turn."""
+    values = np.random.default_rng(0).normal(size=(repeats, STEPS, 3))
+    values[:dead, :, 1] = 0.0
+    with pytest.raises(ValueError, match=rf"a dead sensor\? {do}"):
+        compare(scene, recording(channel("torque", CLOCK, values)))
+    if "mask" in do:
+        mask = np.ones(values.shape, bool)
+        mask[0, :, 1] = False
+        compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+
+
 def test_unknown_channels_and_joints_are_named(scene: Scene):
     values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
     torque = channel("torque", CLOCK, values)

@@ -10,8 +10,8 @@ import pytest
 
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.creep import STIFF, creep_note, creep_per_load, creeping
-from droid_jax.preflight.preflight import clipped_commands, command_notes, exceeded_torques
-from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.preflight.preflight import check_range, clipped_commands, command_notes, exceeded_torques
+from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
 TIME = np.arange(0.0, 10.0, 0.01)
 HINGE = """<mujoco><option integrator="implicitfast" timestep="0.002" {option}/><worldbody>
@@ -71,6 +71,24 @@ def test_the_share_of_torques_beyond_the_actuators_limits_is_said(joint: str, ac
 
 def test_actuators_without_limits_have_none_to_exceed():
     assert not exceeded_torques(hinge(), log(np.sin(TIME), 1e3 * np.sin(TIME)))
+
+
+def test_an_objects_angle_in_degrees_is_outside_of_its_range():
+    """It was not looked at: a door that opened by sixty degrees was taken for one that turns ten times."""
+    spec = hinge().spec.copy()
+    door = spec.worldbody.add_body(name="door")
+    door.add_joint(name="hinge", axis=[0, 0, 1], range=[0, 90], limited=mujoco.mjtLimited.mjLIMITED_TRUE)
+    door.add_geom(size=[0.1, 0, 0])
+    scene = compile_scene(spec, "door", joints=["j"], object_joint="hinge")
+    fine, opened = log(np.sin(TIME), np.sin(TIME)), 0.5 * (1 - np.cos(TIME))[None, :, None] + np.zeros((2, 1, 1))
+
+    def seen(angle: np.ndarray) -> Recording:
+        channel = Channel("object_angle", "rad", ("hinge",), TIME, angle, np.ones(angle.shape, bool))
+        return replace(fine, channels={**fine.channels, "object_angle": channel})
+
+    check_range(scene, seen(opened))
+    with pytest.raises(ValueError, match=r"hinge is measured at 57.* far outside its range 0 \.\. 1.571 rad"):
+        check_range(scene, seen(np.rad2deg(opened)))
 
 
 # ----- creep
@@ -145,6 +163,15 @@ def test_creep_is_said_where_it_is_visible_alone():
     soft = hinge('frictionloss="0.3"', actuator='<position joint="j" kp="5" kv="1"/>')
     found = creeping(soft, log(held, np.where(TIME < 4.0, 0.0, 0.2), np.where(TIME < 4.0, 0.0, 0.26)))
     assert found and found[0].distance <= 0.3 / 5.0
+
+
+def test_a_servo_creeps_by_the_gain_that_the_recording_states():
+    """The scene's stiff servo was taken, which creeps too little to be seen."""
+    scene = hinge('frictionloss="0.3"', actuator='<position joint="j" kp="100" kv="1"/>')
+    held, torque = np.where(TIME < 4.0, 0.0, 0.3), np.where(TIME < 4.0, 0.0, 0.2)
+    right = log(held, torque, np.where(TIME < 4.0, 0.0, 0.26))
+    assert not creep_note(scene, right)
+    assert creep_note(scene, replace(right, gains=ServoGains(np.array([5.0]), np.array([1.0]))))
 
 
 def test_a_fit_that_finds_more_friction_creeps_more():

@@ -209,6 +209,22 @@ def test_stamps_that_are_no_seconds_and_gaps_in_them():
     assert gap.severity == "note" and "'position' has a gap in time, the longest of 0.1 s at 5.9" in gap.sentence
 
 
+def test_slow_clocks_beside_a_usual_one_are_no_milliseconds():
+    """Set-points half a second apart, and a temperature, were said to be stamped in milliseconds, certainly."""
+    fine = recording()
+    rows = np.arange(0.0, 11.9, 0.5)
+    slow = Channel(
+        "temperature", "K", JOINTS, rows, np.ones((REPEATS, len(rows), 2)), np.ones((REPEATS, len(rows), 2), bool)
+    )
+    sparse = replace(fine, time=rows, command=fine.command[:: round(RATE / 2)][: len(rows)])
+    warm = replace(fine, channels={**fine.channels, "temperature": slow})
+    for valid in (sparse, warm):
+        assert not [f for f in check_alone(valid) if f.kind == "clock"]
+    for wrong in (replace(fine, time=1e3 * fine.time), replace(sparse, time=1e3 * rows)):
+        (finding,) = [f for f in check_alone(wrong) if f.kind == "clock"]
+        assert "the steps of the commands" in finding.sentence and "milliseconds" in finding.sentence
+
+
 @pytest.mark.parametrize("gravcomp", [False, True])
 @pytest.mark.parametrize("commands", [True, False])
 def test_weight_that_the_torque_does_not_hold_or_does(gravcomp: bool, commands: bool):
@@ -238,6 +254,38 @@ def test_a_position_that_does_not_move():
     assert ("sensor", "elbow") in found(dead)
     coarse = of_channel("torque", lambda v: np.round(v / 4.0) * 4.0)(recording())
     assert ("sensor", "elbow") in found(coarse)
+
+
+TURNING = np.arange(0.0, 12.0, 0.01)
+
+
+def wheel() -> Scene:
+    xml = """<mujoco><worldbody><body><joint name="wheel" axis="0 0 1" armature="0.01" damping="1"/>
+    <geom size=".1" mass="0.1"/></body></worldbody><actuator><position joint="wheel" kp="50"/></actuator></mujoco>"""
+    return compile_scene(mujoco.MjSpec.from_string(xml), "wheel", joints=["wheel"])
+
+
+def turning(sent: np.ndarray, went: np.ndarray) -> Recording:
+    position = Channel("position", "rad", ("wheel",), TURNING, went[None, :, None], np.ones((1, len(TURNING), 1), bool))
+    convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
+    return Recording("turns", TURNING, sent[:, None], ("wheel",), {"position": position}, convention)
+
+
+@pytest.mark.parametrize("what", ["position", "command"])
+def test_an_angle_that_counts_within_one_turn(what: str):
+    """The position was said to run against its command, with the wrong sign."""
+    signals = {"command": np.pi + 0.3 * np.sin(2 * np.pi * 0.2 * TURNING)}
+    signals["position"] = np.interp(TURNING - 0.02, TURNING, signals["command"])
+    assert not any(f.kind == "units" for f in check_log(wheel(), turning(signals["command"], signals["position"])))
+    signals[what] = (signals[what] + np.pi) % (2 * np.pi) - np.pi
+    (finding,) = check_log(wheel(), turning(signals["command"], signals["position"]))
+    assert finding.severity == "certain" and f"the {what} of wheel jumps by one turn" in finding.sentence
+
+
+def test_a_command_that_turns_once_is_no_jump_of_the_log():
+    went = 2 * np.pi * np.clip((TURNING - 5.0) / 1.0, 0.0, 1.0)
+    found = check_log(wheel(), turning(np.where(TURNING < 5.0, 0.0, 2 * np.pi), went))
+    assert not any(f.kind == "units" for f in found)
 
 
 def test_a_nominal_rate_beside_stamps():
@@ -281,14 +329,28 @@ def test_degrees_of_positions_and_commands_without_torques():
     assert finding.kind == "units" and "are these degrees?" in finding.sentence
 
 
-@pytest.mark.parametrize("factor", [10.0, 0.1])
-def test_gains_of_another_robot_without_torques(factor: float):
+def stronger(factor: float) -> Scene:
+    """The arm with other servo gains than the robot had."""
     spec = scene().spec.copy()
     for actuator in spec.actuators:
         actuator.gainprm[0] *= factor
         actuator.biasprm[1] *= factor
-    other = compile_scene(spec, "other", joints=JOINTS)
-    (finding,) = check_log(other, positions_alone(recording(size=5 * SIZE)))
+    return compile_scene(spec, "other", joints=JOINTS)
+
+
+@pytest.mark.parametrize("factor", [200.0, 10.0])
+def test_gains_that_the_recording_states_count(factor: float):
+    """The scene's were taken, which no replay uses: right torques were found to be wrong, certainly."""
+    fine = recording(size=5 * SIZE)
+    for log in (fine, positions_alone(fine)):
+        assert check_log(stronger(factor), log) == ()
+        assert check_log(stronger(factor), replace(log, gains=None)) != ()
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.1])
+def test_gains_of_another_robot_without_torques(factor: float):
+    unstated = replace(positions_alone(recording(size=5 * SIZE)), gains=None)
+    (finding,) = check_log(stronger(factor), unstated)
     assert finding.kind == "gains" and 0.5 < finding.value / factor < 2.0
     assert "are these gains the robot's?" in finding.sentence
 
