@@ -126,8 +126,8 @@ def run(command: Convert) -> None:
             usual = {"name": command.name, "allow_jitter": command.allow_jitter}
             options = usual if strange else _bag_options(command)
             recording = load_recording(path, resample=command.resample, **options)
-    if command.torque_constant and not _of_currents(command):  # those are in the map
-        recording = with_torque_constants(recording, command.torque_constant)
+        if command.torque_constant:
+            recording = with_torque_constants(recording, command.torque_constant)
     if command.start is not None or command.end is not None:
         first, last = recording.span
         start, end = command.start, command.end
@@ -152,7 +152,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         command.map,
         episodes=command.episodes,
         channels=_pairs(command.columns, "--columns CHANNEL=COLUMN, e.g. position=q{n}"),
-        units=_units(command),
+        units=_pairs(command.units, "--units KIND=UNIT, e.g. angle=deg"),
         beside=command.out.parent,
         name=command.name or command.out.stem,
         command_tolerance=command.command_tolerance,
@@ -165,7 +165,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         stiffness=command.stiffness,
         damping=command.damping,
         rate=command.rate,
-        torque_constant=command.torque_constant if _of_currents(command) else (),
+        torque_constant=command.torque_constant,
     )
     print(f"columns as in {origin}")
 
@@ -174,18 +174,6 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         print(f"the next log of this kind needs no options while {beside} is there")
 
     return recording, keep
-
-
-def _units(command: Convert) -> dict[str, str]:
-    return _pairs(command.units, "--units KIND=UNIT, e.g. angle=deg")
-
-
-def _of_currents(command: Convert) -> bool:
-    """Whether --units says that the torques are currents."""
-    from droid_jax.recordings.units import CURRENTS
-
-    units = _units(command)
-    return any(units.get(kind) in CURRENTS for kind in ("torque", "force"))
 
 
 def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:

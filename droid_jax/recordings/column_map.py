@@ -16,7 +16,7 @@ import tomli_w
 
 from droid_jax.arguments import shown
 from droid_jax.read_json import typed
-from droid_jax.recordings.units import TIMES
+from droid_jax.recordings.units import CURRENTS, TIMES
 from droid_jax.storage import read_text, refuse_foreign, write_text
 
 SUFFIX = ".map.toml"
@@ -178,7 +178,8 @@ def changed_map(
         columns: the map that is changed.
         channels: channel or "time" -> columns, several with commas between them.
         units: "angle", "length", "torque", "force", "time" -> unit.
-        torque_constant: of the torque's columns, one for each joint or one for all.
+        torque_constant: of the torque's columns, one for each joint or one for all; only where their unit is that of
+            a current.
         changes: other fields of `ColumnMap`; None and empty ones change nothing.
     """
     where = "--columns"
@@ -196,9 +197,11 @@ def changed_map(
     if torque_constant:
         if "torque" not in content:
             raise ValueError("--torque-constant: no column of the torque is named (--columns torque=...)")
-        entry = content["torque"]
-        of_one = torque_constant[0] if len(torque_constant) == 1 else list(torque_constant)
-        content["torque"] = {**(entry if isinstance(entry, dict) else {"columns": entry}), "torque_constant": of_one}
+        entry = content["torque"] if isinstance(content["torque"], dict) else {"columns": content["torque"]}
+        of_all = [content["units"].get(kind) for kind in ("torque", "force")]
+        if "torque_constant" in entry or any(unit in CURRENTS for unit in as_list(entry.get("unit") or of_all)):
+            of_one = torque_constant[0] if len(torque_constant) == 1 else list(torque_constant)
+            content["torque"] = {**entry, "torque_constant": of_one}
     content |= {name: list(v) if isinstance(v, tuple) else v for name, v in changes.items() if v not in (None, ())}
     return check_map(typed(content, ColumnMap, where), where)
 

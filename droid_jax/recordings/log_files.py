@@ -18,6 +18,7 @@ from droid_jax.recordings.column_map import SUFFIX, ColumnMap, changed_map, layo
 from droid_jax.recordings.log_columns import INFO, LogColumns, width_of
 from droid_jax.recordings.mapped_log import Opened, fits, read_logs
 from droid_jax.recordings.recording import Phase, Recording
+from droid_jax.recordings.units import with_torque_constants
 
 TABLES = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
 PARQUET, HDF5, NPZ, TORCH = (".parquet",), (".h5", ".hdf5"), (".npz",), (".pt", ".pth")
@@ -58,6 +59,7 @@ def read_log(
     command_tolerance: float = 5e-3,
     phases: Sequence[Phase] = (),
     allow_jitter: bool = False,
+    torque_constant: Sequence[float] = (),
     **changes: Any,
 ) -> tuple[Recording, ColumnMap, str]:
     """Logs, one per repeat, as a recording.
@@ -71,6 +73,7 @@ def read_log(
         beside: folder in which maps of earlier logs are looked for.
         name: of the recording; the first log's by default.
         command_tolerance, phases, allow_jitter: as in `read_logs`.
+        torque_constant: of torques that are currents, in place of the map's; others are multiplied with it.
 
     Returns:
         The recording, the map it was read by, and where that is from.
@@ -87,7 +90,7 @@ def read_log(
     if columns is None:
 
         def changed(known: ColumnMap) -> ColumnMap:
-            return changed_map(known, channels or {}, units or {}, **changes)
+            return changed_map(known, channels or {}, units or {}, torque_constant, **changes)
 
         found, origin = _known_map(logs[0], paths[0], beside, changed)
     elif isinstance(columns, ColumnMap):
@@ -99,7 +102,7 @@ def read_log(
             f"{paths[0]}: does not say which of its columns are what: give a map, --map FILE.toml, or --columns "
             f"position=... command=... time=... (docs/file-formats.md); it has: {_columns_of(paths[0], logs[0])}"
         )
-    found = changed_map(found, channels or {}, units or {}, **changes)
+    found = changed_map(found, channels or {}, units or {}, torque_constant, **changes)
     if not found.joints and (names := _named_joints(logs[0], found)):
         found = changed_map(found, {}, {}, joints=names)
     recording = read_logs(
@@ -110,6 +113,9 @@ def read_log(
         phases=phases,
         allow_jitter=allow_jitter,
     )
+    entry = found.channel("torque")
+    if torque_constant and (entry is None or entry.torque_constant is None):  # otherwise the map has counted it
+        recording = with_torque_constants(recording, torque_constant)
     return recording, found, origin or "--columns"
 
 

@@ -513,6 +513,24 @@ def test_currents_need_no_map_file(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "--torque-constant: no column of the torque" in capsys.readouterr().err
 
 
+def test_a_torque_constant_counts_once(tmp_path: Path):
+    """It was in the kept map, and was multiplied again where the command stated it again without the unit."""
+    path, out = log(tmp_path / "a.csv"), tmp_path / "out"
+    said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "torque=tau{n}", "--joints", *JOINTS]
+    said += ["--units", "angle=rad", "torque=mA", "--torque", "motor", "--gravity"]
+    assert main(["convert", str(path), *said, "--torque-constant", "1.8", "-1.2", "--out", str(out / "one.npz")]) == 0
+    assert main(["convert", str(path), "--torque-constant", "1.5", "-1.2", "--out", str(out / "two.npz")]) == 0
+    unit = whole(torque=ChannelMap("tau{n}", unit="mA"))  # and no constant
+    write_map(unit, tmp_path / "servo.toml")
+    again = ["--map", str(tmp_path / "servo.toml"), "--torque-constant", "1.5", "-1.2"]
+    assert main(["convert", str(path), *again, "--out", str(tmp_path / "three.npz")]) == 0
+    for file in (out / "two.npz", tmp_path / "three.npz"):
+        torque = load_recording(file).channels["torque"].values[0]
+        np.testing.assert_allclose(torque, 1e-3 * TORQUE * [1.5, -1.2], rtol=1e-6)
+    plain = load_recording(path, columns=whole(), torque_constant=[2.0])  # efforts in another unit than stated
+    np.testing.assert_allclose(plain.channels["torque"].values[0], 2.0 * TORQUE, rtol=1e-6)
+
+
 def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     first, second = log(tmp_path / "a.csv"), log(tmp_path / "b.csv", q9=POSITION[:, 0] + 0.1)
     said = ["--columns", "time=t", "command=cmd{n}", "position=q9,q10", "--units", "angle=rad", "--joints", *JOINTS]
