@@ -142,6 +142,8 @@ def run(command: Convert) -> None:
 
 def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     """The recording in logs with a column map, and what keeps that map for the next log."""
+    from msgspec.structs import replace
+
     from droid_jax.recordings.column_map import check_map_target, map_beside, write_map
     from droid_jax.recordings.log_files import read_log
 
@@ -170,8 +172,13 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     print(f"columns as in {origin}")
 
     def keep() -> None:
-        write_map(columns, beside)
+        write_map(replace(columns, stiffness=[], damping=[]), beside)  # gains are changed between logs
         print(f"the next log of this kind needs no options while {beside} is there")
+        if columns.stiffness:
+            print("but its own --stiffness and --damping: servo gains are of one log, and the map does not keep them")
+        torque = columns.channel("torque")
+        if command.torque_constant and torque is not None and torque.torque_constant is None:
+            print("but its --torque-constant: the map keeps those of torques in A, mA, V and % alone")
 
     return recording, keep
 

@@ -531,6 +531,20 @@ def test_a_torque_constant_counts_once(tmp_path: Path):
     np.testing.assert_allclose(plain.channels["torque"].values[0], 2.0 * TORQUE, rtol=1e-6)
 
 
+def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The kept map held them, so that the next log stated the first one's."""
+    path, out = log(tmp_path / "kp200.csv"), tmp_path / "out"
+    said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "--units", "angle=rad", "--joints", *JOINTS]
+    given = ["--stiffness", "20", "20", "--damping", "0", "1"]
+    assert main(["convert", str(path), *said, *given, "--out", str(out / "kp200.npz")]) == 0
+    assert "but its own --stiffness and --damping: servo gains are of one log" in capsys.readouterr().out
+    gains = load_recording(out / "kp200.npz").gains
+    assert gains is not None and gains.stiffness.tolist() == [20.0, 20.0]
+    assert main(["convert", str(path), "--out", str(out / "kp800.npz")]) == 0
+    assert load_recording(out / "kp800.npz").gains is None
+    assert "servo gains" not in capsys.readouterr().out
+
+
 def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     first, second = log(tmp_path / "a.csv"), log(tmp_path / "b.csv", q9=POSITION[:, 0] + 0.1)
     said = ["--columns", "time=t", "command=cmd{n}", "position=q9,q10", "--units", "angle=rad", "--joints", *JOINTS]
