@@ -52,8 +52,8 @@ class Convert:
     slides: tuple[str, ...] = ()
     """Those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
     torque: Literal["motor", "link", "none"] | None = None
-    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: of
-    bags, it is not read."""
+    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: it
+    is not read."""
     gravity: bool = False
     """The torque contains what carries the arm's weight."""
     torque_constant: tuple[float, ...] = ()
@@ -162,8 +162,9 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
         allow_jitter=command.allow_jitter,
         joints=command.joints,
         slides=command.slides,
-        side=None if command.torque == "none" else command.torque,
-        gravity=command.gravity or (False if command.torque else None),
+        side=command.torque,
+        gravity=command.gravity or None,
+        unstated={"gravity": False} if command.torque in ("motor", "link") else {},
         stiffness=command.stiffness,
         damping=command.damping,
         rate=command.rate,

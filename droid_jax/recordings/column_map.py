@@ -170,6 +170,7 @@ def changed_map(
     channels: Mapping[str, str],
     units: Mapping[str, str],
     torque_constant: Sequence[float] = (),
+    unstated: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> ColumnMap:
     """A map with what the command line says in place of its own; None: of nothing but that.
@@ -180,7 +181,8 @@ def changed_map(
         units: "angle", "length", "torque", "force", "time" -> unit.
         torque_constant: of the torque's columns, one for each joint or one for all; only where their unit is that of
             a current.
-        changes: other fields of `ColumnMap`; None and empty ones change nothing.
+        unstated: other fields of `ColumnMap`, where neither the map nor `changes` states them.
+        changes: other fields of `ColumnMap`; None and empty ones change nothing.  The side "none" takes the torque out.
     """
     where = "--columns"
     content: dict[str, Any] = {} if columns is None else msgspec.to_builtins(columns)
@@ -191,18 +193,22 @@ def changed_map(
         names = [word.strip() for word in _split(words)]
         given = names[0] if len(names) == 1 else names
         content[name] = {**entry, "columns": given} if isinstance(entry, dict) else given
+    if changes.get("side") == "none":
+        of_torque = ("torque", "side", "gravity")
+        content, changes = ({k: v for k, v in d.items() if k not in of_torque} for d in (content, changes))
     if strange := [name for name in units if name not in Units.__struct_fields__]:
         raise ValueError(f"--units: {strange[0]!r} has no unit; known are: {', '.join(Units.__struct_fields__)}")
     content["units"] = {**content.get("units", {}), **units}
     if torque_constant:
         if "torque" not in content:
-            raise ValueError("--torque-constant: no column of the torque is named (--columns torque=...)")
+            raise ValueError("--torque-constant: no column of the torque is read (--columns torque=..., --torque)")
         entry = content["torque"] if isinstance(content["torque"], dict) else {"columns": content["torque"]}
         of_all = [content["units"].get(kind) for kind in ("torque", "force")]
         if "torque_constant" in entry or any(unit in CURRENTS for unit in as_list(entry.get("unit") or of_all)):
             of_one = torque_constant[0] if len(torque_constant) == 1 else list(torque_constant)
             content["torque"] = {**entry, "torque_constant": of_one}
     content |= {name: list(v) if isinstance(v, tuple) else v for name, v in changes.items() if v not in (None, ())}
+    content = {**(unstated or {}), **content}
     return check_map(typed(content, ColumnMap, where), where)
 
 

@@ -510,7 +510,7 @@ def test_currents_need_no_map_file(tmp_path: Path, capsys: pytest.CaptureFixture
         np.testing.assert_allclose(torque, POSITION[:, :1] * [1.8, -0.6], rtol=1e-6)
     wrong = [word for word in said if not word.startswith("torque=tau")]
     assert main(["convert", str(path), *wrong, "--torque-constant", "2", "--out", str(tmp_path / "no" / "x.npz")]) == 2
-    assert "--torque-constant: no column of the torque" in capsys.readouterr().err
+    assert "--torque-constant: no column of the torque is read" in capsys.readouterr().err
 
 
 def test_a_torque_constant_counts_once(tmp_path: Path):
@@ -529,6 +529,28 @@ def test_a_torque_constant_counts_once(tmp_path: Path):
         np.testing.assert_allclose(torque, 1e-3 * TORQUE * [1.5, -1.2], rtol=1e-6)
     plain = load_recording(path, columns=whole(), torque_constant=[2.0])  # efforts in another unit than stated
     np.testing.assert_allclose(plain.channels["torque"].values[0], 2.0 * TORQUE, rtol=1e-6)
+
+
+def test_torque_on_the_command_line_and_in_the_map(tmp_path: Path):
+    """`none` kept the torque and turned its gravity off, and so did a side that is stated again."""
+    path, columns = log(tmp_path / "a.csv"), tmp_path / "servo.toml"
+    write_map(whole(), columns)
+
+    def made(*words: str) -> Recording:
+        assert main(["convert", str(path), "--map", str(columns), *words, "--out", str(tmp_path / "a.npz")]) == 0
+        return load_recording(tmp_path / "a.npz")
+
+    without = made("--torque", "none")
+    assert "torque" not in without.channels and "position" in without.channels
+    kept = read_map(tmp_path / "a.map.toml")
+    assert kept.torque is None and kept.side is None and kept.gravity is None
+    link = made("--torque", "link")
+    assert link.torque.side is TorqueSide.LINK and link.torque.gravity and "torque" in link.channels
+    write_map(whole(gravity=False), columns)
+    assert made("--torque", "motor", "--gravity").torque.gravity and not made("--torque", "motor").torque.gravity
+    write_map(whole(torque=None, side=None, gravity=None), columns)
+    new = made("--columns", "torque=tau{n}", "--torque", "motor")
+    assert "torque" in new.channels and not new.torque.gravity
 
 
 def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
