@@ -16,13 +16,16 @@ import tomli_w
 
 from droid_jax.arguments import shown
 from droid_jax.read_json import typed
-from droid_jax.recordings.units import CURRENTS, TIMES
+from droid_jax.recordings.units import CURRENTS, HINGES, KINDS, SLIDES, TIMES
 from droid_jax.storage import read_text, refuse_foreign, write_text
 
 SUFFIX = ".map.toml"
 HEAD = "# Column map of droid_jax: `python -m droid_jax.run convert LOG --map THIS_FILE`"
 MOST_BYTES = 2**18  # of a map
 CHANNELS = ("command", "position", "velocity", "torque", "object_angle")
+_POSITIONS = ("command", "position", "velocity", "object_angle")
+# kind of `Units` -> what may state a unit of its own
+_STATE = {"angle": _POSITIONS, "length": _POSITIONS, "torque": ("torque",), "force": ("torque",), "time": ("time",)}
 LAYOUTS = Path(__file__).parent / "layouts"  # maps of layouts that many use
 
 
@@ -178,7 +181,7 @@ def changed_map(
     Args:
         columns: the map that is changed.
         channels: channel or "time" -> columns, several with commas between them.
-        units: "angle", "length", "torque", "force", "time" -> unit.
+        units: "angle", "length", "torque", "force", "time" -> unit, also of channels that state their own.
         torque_constant: of the torque's columns, one for each joint or one for all; only where their unit is that of
             a current.
         unstated: other fields of `ColumnMap`, where neither the map nor `changes` states them.
@@ -199,6 +202,8 @@ def changed_map(
     if strange := [name for name in units if name not in Units.__struct_fields__]:
         raise ValueError(f"--units: {strange[0]!r} has no unit; known are: {', '.join(Units.__struct_fields__)}")
     content["units"] = {**content.get("units", {}), **units}
+    for kind, unit in units.items():
+        content |= {k: _restated(content[k], k, kind, unit) for k in _STATE[kind] if isinstance(content.get(k), dict)}
     if torque_constant:
         if "torque" not in content:
             raise ValueError("--torque-constant: no column of the torque is read (--columns torque=..., --torque)")
@@ -210,6 +215,18 @@ def changed_map(
     content |= {name: list(v) if isinstance(v, tuple) else v for name, v in changes.items() if v not in (None, ())}
     content = {**(unstated or {}), **content}
     return check_map(typed(content, ColumnMap, where), where)
+
+
+def _restated(entry: dict[str, Any], key: str, kind: str, unit: str) -> dict[str, Any]:
+    """A map's entry with its own unit of that kind, if it states one, replaced by another."""
+    if not (own := as_list(entry.get("unit") or ())):
+        return entry
+    if key == "time":
+        return {name: value for name, value in entry.items() if name != "unit"}
+    known = (SLIDES if kind in ("length", "force") else HINGES)[KINDS[key]]
+    per = "/s" if key == "velocity" else ""  # not rpm, which is no angle per second
+    new = [f"{unit}{per}" if one in known and one.endswith(per) else one for one in own]
+    return {**entry, "unit": new[0] if isinstance(entry["unit"], str) else new}
 
 
 def _split(words: str) -> list[str]:

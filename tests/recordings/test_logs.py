@@ -16,7 +16,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from droid_jax.recordings.column_map import ChannelMap, ColumnMap, TimeMap, Units, layouts, read_map, write_map
+from droid_jax.recordings.column_map import (
+    ChannelMap,
+    ColumnMap,
+    TimeMap,
+    Units,
+    changed_map,
+    layouts,
+    read_map,
+    write_map,
+)
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.log_files import read_log
 from droid_jax.recordings.recording import Recording, TorqueSide
@@ -529,6 +538,30 @@ def test_a_torque_constant_counts_once(tmp_path: Path):
         np.testing.assert_allclose(torque, 1e-3 * TORQUE * [1.5, -1.2], rtol=1e-6)
     plain = load_recording(path, columns=whole(), torque_constant=[2.0])  # efforts in another unit than stated
     np.testing.assert_allclose(plain.channels["torque"].values[0], 2.0 * TORQUE, rtol=1e-6)
+
+
+def test_units_on_the_command_line_are_those_of_channels_that_state_their_own(tmp_path: Path):
+    """They were ignored there, and the numbers read in the map's unit."""
+    degrees = {
+        f"{name}{10 - i}": np.degrees(v[:, 1 - i])
+        for name, v in {"cmd": COMMAND, "q": POSITION}.items()
+        for i in (0, 1)
+    }
+    path = log(tmp_path / "a.csv", t=np.round(TIME * 1e3), tau9=1e3 * TORQUE[:, 0], tau10=1e3 * TORQUE[:, 1], **degrees)
+    columns = whole(
+        time=TimeMap("t", "s"),
+        command=ChannelMap("cmd{n}", unit="rad"),
+        position=ChannelMap("q{n}", unit=["rad", "rad"]),
+        velocity=ChannelMap("dq{n}", unit="rpm"),
+        torque=ChannelMap("tau{n}", unit="N m"),
+        units=Units(),
+    )
+    write_map(columns, tmp_path / "servo.toml")
+    said = {"angle": "deg", "torque": "mN m", "time": "ms"}
+    found = load_recording(path, columns=tmp_path / "servo.toml", units=said)
+    check(found, position=POSITION, velocity=VELOCITY * 2 * np.pi / 60, torque=TORQUE)  # rpm is no angle per second
+    per = changed_map(whole(velocity=ChannelMap("dq{n}", unit=["rad/s", "m/s"])), {}, {"angle": "deg"}).velocity
+    assert isinstance(per, ChannelMap) and per.unit == ["deg/s", "m/s"]  # a length is none of these angles
 
 
 def test_torque_on_the_command_line_and_in_the_map(tmp_path: Path):
