@@ -87,9 +87,11 @@ def read_logs(
         phases=tuple(phases),
         meta=_meta(places, _first(logs[0], columns), columns),
     )
-    # A state log may begin long before the first command, from which the replay starts.
-    begun = recording.measured_start()
-    qpos0 = {joint: begun.get(joint, first) for joint, first in start_positions(channels).items()}
+    # A state log may begin long before the first command, from which the replay starts; or after it, and then it does
+    # not tell the start.
+    first, begun = start_positions(channels), recording.measured_start()
+    known = begun if commands else {**first, **begun}
+    qpos0 = {joint: known[joint] for joint in first if joint in known}
     return accept(replace(recording, qpos0=qpos0), ", ".join(places), allow_jitter)
 
 

@@ -288,6 +288,17 @@ def test_a_motion_begins_where_its_first_command_finds_the_robot(tmp_path: Path)
     np.testing.assert_array_equal(one.mask[0].all(axis=1), one.time <= 1.0 + 1e-6)
 
 
+def test_what_is_measured_late_is_no_start(tmp_path: Path):
+    """A log whose measurements begin at 1 s stated their first pose as that of the first command."""
+    late = TIME >= 1.0
+    np.savez(tmp_path / "a.npz", t=TIME, cmd=COMMAND, ts=TIME[late], q=POSITION[late])
+    position = ChannelMap("q", time="ts")
+    columns = ColumnMap(joints=list(JOINTS), time="t", command="cmd", position=position, units=RAD)
+    assert load_recording(tmp_path / "a.npz", columns=columns).qpos0 == {}
+    alone = load_recording(tmp_path / "a.npz", columns=msgspec.structs.replace(columns, command=None))
+    assert alone.qpos0 == pytest.approx(dict(zip(JOINTS, POSITION[late][0], strict=True)))
+
+
 def test_what_a_table_lacks_is_said_in_a_sentence(tmp_path: Path):
     path = log(tmp_path / "a.csv")
     assert "no column 'angle'; it has: t, state, cmd10" in refused(path, whole(position="angle"))
