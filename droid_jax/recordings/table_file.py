@@ -1,12 +1,16 @@
 """Tables, CSV or parquet, as columns; read with polars.
 
-A cell may hold a list: as a list of parquet, or as the text "[0.1, 0.2]" of CSV.  Dates become nanoseconds.
+A cell may hold a list: as a list of parquet, or as the text "[0.1, 0.2]" of CSV.  Dates become nanoseconds.  CSV files
+are read as pandas, numpy's savetxt and spreadsheets with decimal commas write them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gzip
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -19,10 +23,13 @@ MOST_BYTES = 2**31  # of a table: ten minutes of fourteen columns at 1 kHz have 
 SAMPLE = 10_000  # rows that tell the types of columns
 SEPARATORS = (",", ";", "\t")
 _LIST_SIGNS = r"[\[\]()]"
+_DECIMAL = r"^[+-]?\d*,?\d+([eE][+-]?\d+)?$"  # a number, with a decimal comma or without
 
 
 def open_csv(path: Path) -> LogColumns:
     """The columns of a CSV file, also with gzip; the separator is a comma, a semicolon or a tab.
+
+    A column without a name is called as pandas calls it, "Unnamed: 0".
 
     Raises:
         ValueError: it is no such table.
@@ -30,21 +37,64 @@ def open_csv(path: Path) -> LogColumns:
     if check_size(path, MOST_BYTES) == 0:
         raise ValueError(f"{path}: the file is empty")
     with readable(path, "table"):
-        try:
-            frame = _read(path, SAMPLE)
-        except pl.exceptions.ComputeError:  # a type that changes further down: all rows are looked at
-            frame = _read(path, None)
+        comments, header = _head(path)
+        separator = max(SEPARATORS, key=header.count)  # which has no lists, whose commas are none between columns
+        options: dict[str, Any] = {"separator": separator}
+        if names := _names_in_comments(comments, header, separator, path):
+            options |= {"has_header": False, "new_columns": names}
+        frame = _read(path, options)
+        if separator != ",":
+            frame = frame.with_columns(_with_points(column) for column in frame if _decimal_commas(column))
         # A space behind the separator makes texts of numbers.
-        names = [name.strip() for name in frame.columns]
-        if len(set(names)) < len(names) or "" in names:
+        names = [name.strip() or f"Unnamed: {i}" for i, name in enumerate(frame.columns)]
+        if len(set(names)) < len(names):
             raise ValueError(f"{path}, line 1: expected a header of different names, got {shown(names, 200)}")
         frame.columns = names
         return _columns(str(path), frame)
 
 
-def _read(path: Path, sample: int | None) -> pl.DataFrame:
-    """The table, its types as `sample` rows have them; None: as all have."""
-    return pl.read_csv(path, separator=_separator(path), infer_schema_length=sample, comment_prefix="#")
+def _read(path: Path, options: dict[str, Any]) -> pl.DataFrame:
+    """The table, its types as its first rows have them; where they change further down, as all have."""
+    # The last try is of texts that look like dates and are none.
+    for sample, dates in ((SAMPLE, True), (None, True)):
+        with contextlib.suppress(pl.exceptions.ComputeError):
+            return _read_as(path, sample, dates, options)
+    return _read_as(path, None, False, options)
+
+
+def _read_as(path: Path, sample: int | None, dates: bool, options: dict[str, Any]) -> pl.DataFrame:
+    return pl.read_csv(path, infer_schema_length=sample, comment_prefix="#", try_parse_dates=dates, **options)
+
+
+def _decimal_commas(column: pl.Series) -> bool:
+    """Whether a column holds texts of numbers with decimal commas."""
+    if column.dtype != pl.String:
+        return False
+    known = column.drop_nulls().str.strip_chars()
+    return bool(known.str.contains(",").any() and known.str.contains(_DECIMAL).all())
+
+
+def _with_points(column: pl.Series) -> pl.Series:
+    return column.str.strip_chars().str.replace(",", ".", literal=True).cast(pl.Float64)
+
+
+def _names_in_comments(comments: Sequence[str], header: str, separator: str, path: Path) -> list[str]:
+    """Names of the columns where the line below the comments has numbers, none where it has the names.
+
+    numpy's savetxt writes its header as a comment.  ValueError where no comment has as many names.
+    """
+    first = header.split(separator)
+    if not all(_text_width(text) for text in first):
+        return []
+    for line in reversed(comments):
+        if len(names := line.lstrip("# ").split(separator)) == len(first):
+            return names
+    if first == [str(i) for i in range(len(first))]:  # columns that pandas has numbered
+        return []
+    raise ValueError(
+        f"{path}, line {len(comments) + 1}: expected the names of the columns, got numbers, {shown(header, 60)}; "
+        "write a header above them"
+    )
 
 
 def open_parquet(path: Path) -> LogColumns:
@@ -87,19 +137,15 @@ def _nanoseconds(column: pl.Series) -> pl.Series:
     return column.dt.epoch("ns") if isinstance(column.dtype, pl.Datetime | pl.Date) else column.cast(pl.Int64)
 
 
-def _separator(path: Path) -> str:
-    """The one of SEPARATORS that stands most often in the header."""
+def _head(path: Path) -> tuple[list[str], str]:
+    """The comments in front of the header, and the header."""
     with path.open("rb") as file:
         zipped = file.read(2) == b"\x1f\x8b"
     with gzip.open(path) if zipped else path.open("rb") as file:
-        header = b""
-        for _ in range(1000):  # lines of comments in front of the header
-            header = file.readline(2**16)
-            if not header.startswith(b"#"):
-                break
-    # Commas inside of a list are none between columns; a header has no lists.
-    text = header.decode("utf-8-sig", errors="replace")
-    return max(SEPARATORS, key=text.count)
+        lines: list[str] = []
+        while not lines or (lines[-1].startswith("#") and len(lines) < 1000):
+            lines.append(file.readline(2**16).decode("utf-8-sig", errors="replace").rstrip("\r\n"))
+    return lines[:-1], lines[-1]
 
 
 def _numeric(kind: pl.DataType) -> bool:

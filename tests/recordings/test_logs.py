@@ -116,6 +116,39 @@ def test_csv(tmp_path: Path, name: str, separator: str):
     assert found.qpos0 == pytest.approx(dict(zip(JOINTS, POSITION[0], strict=True)))
 
 
+def test_tables_as_other_programs_write_them(tmp_path: Path):
+    """An unnamed column, decimal commas, dates and a header in a comment were refused, or read as texts."""
+    columns = whole(command="cmd{n}", velocity=None, torque=None, side=None, gravity=None)
+    lines = log(tmp_path / "a.csv").read_text().splitlines()
+    stamp = np.datetime_as_string(np.datetime64("2024-05-01T23:59:59.5") + (1e6 * TIME).astype("timedelta64[us]"))
+
+    def read(*new: str, name: str = "b.csv", **changes: object) -> None:
+        (tmp_path / name).write_text("\n".join(new) + "\n")
+        map_ = msgspec.structs.replace(columns, **changes)  # type: ignore[type-var]
+        check(load_recording(tmp_path / name, columns=map_), 1e-6, position=POSITION)
+
+    read(*(f"{'' if i == 0 else i - 1},{line}" for i, line in enumerate(lines)))  # to_csv() of pandas
+    read(*(f"{'' if i == 0 else TIME[i - 1]},{line}" for i, line in enumerate(lines)), time="Unnamed: 0")  # an index
+    read(*(f"{line},," for line in lines))
+    read(f"# {lines[0]}", *lines[1:])  # numpy's savetxt(header=...)
+    read("# Monday", f"#{lines[0]}", "# N m, rad", *lines[1:])
+    read(*(line.replace(",", ";").replace(".", ",") for line in lines))  # a spreadsheet's decimal comma
+    read(*(line.replace(",", ";\t").replace(".", ",") for line in lines))
+    read(*(line.replace(",", "\t").replace(".", ",") for line in lines), name="b.tsv")
+    for written in (stamp, [f"{text.replace('T', ' ')}+02:00" for text in stamp]):
+        dated = (f"{'date' if i == 0 else written[i - 1]},{line}" for i, line in enumerate(lines))
+        read(*dated, time="date", units=Units(angle="rad"))
+    read(
+        *(f"{'id' if i == 0 else '20240501T120000'},{line}" for i, line in enumerate(lines))
+    )  # polars takes it for one
+    (tmp_path / "c.csv").write_text("\n".join(["# a note", *lines[1:]]))
+    assert "c.csv, line 2: expected the names of the columns, got numbers, " in refused(tmp_path / "c.csv", columns)
+    numbered = {str(i): values for i, values in enumerate((TIME, COMMAND[:, 0], POSITION[:, 0]))}  # DataFrame(array)
+    one = ColumnMap(joints=["shoulder"], time="0", command="1", position="2", units=RAD)
+    found = load_recording(table(tmp_path / "d.csv", **numbered), columns=one)
+    assert found.channels["position"].values[0, :, 0] == pytest.approx(POSITION[:, 0])
+
+
 def test_lists_in_the_cells_of_several_files(tmp_path: Path):
     """As of isaac-sim2real/sage: a folder of control.csv and state_motor.csv, in microseconds."""
     for name, columns in {
