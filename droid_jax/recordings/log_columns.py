@@ -87,12 +87,16 @@ class LogColumns:
         return None
 
     def numbers(self, name: str) -> np.ndarray:
-        """[T] or [T, W] of a column in the type that it has; ValueError where it is not there or no numbers."""
+        """[T] or [T, W] of a column in the type that it has, [T] also of [T, 1], as MATLAB writes vectors.
+
+        ValueError where it is not there or no numbers.
+        """
         if name not in self.widths:
             raise ValueError(f"{self.where}: no column {shown(name)}; it has: {named(self.widths) or 'none'}")
         if not self.widths[name]:
             raise ValueError(f"{self.where}: the column {shown(name)} holds no numbers")
-        return self.read(name)
+        numbers = self.read(name)
+        return numbers[:, 0] if numbers.ndim == 2 and numbers.shape[1] == 1 else numbers
 
     def _by_name(self, name: str, joints: Sequence[str]) -> list[str] | None:
         """Columns of a vector's components that are named as the joints; None where one is not."""

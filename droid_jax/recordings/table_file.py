@@ -38,7 +38,8 @@ def open_csv(path: Path) -> LogColumns:
         raise ValueError(f"{path}: the file is empty")
     with readable(path, "table"):
         comments, header = _head(path)
-        separator = max(SEPARATORS, key=header.count)  # which has no lists, whose commas are none between columns
+        # Commas inside of a list are none between columns; a header has no lists.
+        separator = max(SEPARATORS, key=header.count)
         options: dict[str, Any] = {"separator": separator}
         if names := _names_in_comments(comments, header, separator, path):
             options |= {"has_header": False, "new_columns": names}

@@ -369,6 +369,18 @@ def test_npz_of_any_names(tmp_path: Path):
     assert "holds no numbers" in refused(tmp_path / "a.npz", whole(time="note", command=None, position="q"))
 
 
+def test_vectors_that_are_columns(tmp_path: Path):
+    """Time and powered as [T, 1], as MATLAB and t[:, None] write them, were refused."""
+    np.savez(tmp_path / "a.npz", t=TIME[:, None], on=np.ones((len(TIME), 1)), cmd=COMMAND, q=POSITION[:, :1])
+    columns = ColumnMap(
+        joints=list(JOINTS), time="t", command="cmd", powered="on", units=RAD,
+        position=ChannelMap("q[0]", joints=["shoulder"]),
+    )  # fmt: skip
+    found = load_recording(tmp_path / "a.npz", columns=columns)
+    assert found.time == pytest.approx(TIME)
+    assert found.channels["position"].values[0] == pytest.approx(POSITION[:, :1])
+
+
 def droid(path: Path) -> Path:
     """trajectory.h5 as DROID publishes it."""
     h5py = pytest.importorskip("h5py")
