@@ -48,7 +48,7 @@ class Convert:
     episodes: tuple[str, ...] = ()
     """LeRobot: numbers of the episodes; HDF5: groups, e.g. data/demo_0. Each is one repeat."""
     joints: tuple[str, ...] = ()
-    """Measured joints, in the order wanted."""
+    """Measured joints, in the order wanted. Of bags also as NAME=NAME_IN_THE_MESSAGES, e.g. joint1=panda_joint1."""
     slides: tuple[str, ...] = ()
     """Those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
     torque: Literal["motor", "link", "none"] | None = None
@@ -69,7 +69,8 @@ class Convert:
     damping: tuple[float, ...] = ()
     """Servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
     command_joints: tuple[str, ...] = ()
-    """Bags: commanded joints, in the order of commands that carry no names; default: --joints."""
+    """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
+    --joints."""
     motors: tuple[int, ...] = ()
     """Bags: places of --joints in messages without names that hold more joints (unitree's), counted from 0."""
     velocity_actuators: tuple[str, ...] = ()
@@ -195,6 +196,14 @@ def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:
     return out
 
 
+def _joints(words: tuple[str, ...]) -> tuple[str, ...] | dict[str, str]:
+    """Names of joints; as a mapping where their names in the messages are given."""
+    if not any("=" in word for word in words):
+        return words
+    same = tuple(word if "=" in word else f"{word}={word}" for word in words)
+    return _pairs(same, "joints as NAME or NAME=NAME_IN_THE_MESSAGES")
+
+
 def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:
     """ValueError for options that would change nothing; a path that does not exist is reported as such.
 
@@ -229,13 +238,13 @@ def _bag_options(command: Convert) -> dict[str, Any]:
     options = {
         "name": command.name or command.out.stem,
         "allow_jitter": command.allow_jitter,
-        "joints": command.joints,
+        "joints": _joints(command.joints),
         "slides": command.slides,
         "torque": None if command.torque == "none" else TorqueConvention(TorqueSide(command.torque), command.gravity),
         "state_topic": command.state_topic,
         "command_topic": command.command_topic,
         "gains": gains,
-        "command_joints": command.command_joints or None,
+        "command_joints": _joints(command.command_joints) or None,
         "motors": command.motors or None,
         "velocity_actuators": command.velocity_actuators,
         "effort_actuators": command.effort_actuators,

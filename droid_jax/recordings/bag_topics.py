@@ -5,6 +5,7 @@ Joint states, trajectories, arrays of numbers and states of a controller become 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +73,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, wanted: Wanted) -> Tra
         where = f"{bag}, topic {topic!r}, message {number}"
         for offset, names, fields in samples(message, wanted, connection.msgtype, where):
             seen.update(names)
-            picked = _pick(fields, names, joints, needed, where)
+            picked = _pick(fields, names, wanted, where)
             if picked is None:
                 continue
             rows.append(picked)
@@ -80,7 +81,10 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, wanted: Wanted) -> Tra
             received.append(nanoseconds + offset)
             stamped.append(_header_stamp(message, offset))
     if not rows and seen:
-        raise ValueError(f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {named(sorted(seen))}")
+        raise ValueError(
+            f"{bag}, topic {topic!r}: no joint of {', '.join(joints)}; it has: {named(sorted(seen))}"
+            f"{_remedy(joints, sorted(seen), wanted)}"
+        )
     if not rows:
         raise ValueError(f"{bag}, topic {topic!r}: no messages")
     without = [number for number, row in zip(numbers, rows, strict=True) if needed not in row]
@@ -108,17 +112,20 @@ def _header_stamps(stamped: Sequence[int | None]) -> np.ndarray | None:
 
 
 def _pick(
-    fields: Mapping[str, np.ndarray], names: tuple[str, ...], joints: tuple[str, ...], needed: str, where: str
+    fields: Mapping[str, np.ndarray], names: tuple[str, ...], wanted: Wanted, where: str
 ) -> dict[str, np.ndarray] | None:
     """field -> [J] numbers of the joints wanted, without empty fields; finite in the field `needed`.
 
     None when the message has none of them: arm and gripper often share a topic.
     """
+    joints = wanted.joints
     missing = [j for j in joints if j not in names]
     if len(missing) == len(joints):
         return None
     if missing:
-        raise ValueError(f"{where}: no joint {', '.join(missing)}; the message has: {named(names)}")
+        raise ValueError(
+            f"{where}: no joint {', '.join(missing)}; the message has: {named(names)}{_remedy(missing, names, wanted)}"
+        )
     order = [names.index(j) for j in joints]
     picked = {}
     for field, numbers in fields.items():
@@ -127,7 +134,21 @@ def _pick(
         if len(numbers) != len(names):
             raise ValueError(f"{where}: expected {len(names)} numbers in {field!r}, got {len(numbers)}")
         bad = [j for j, i in zip(joints, order, strict=True) if not np.isfinite(numbers[i])]
-        if bad and field == needed:
+        if bad and field == wanted.needed:
             raise ValueError(f"{where}: {field} of joint {bad[0]!r} is {numbers[names.index(bad[0])]}, not finite")
         picked[field] = numbers[order]
     return picked
+
+
+def _remedy(missing: Sequence[str], names: Sequence[str], wanted: Wanted) -> str:
+    """How to read a joint that messages name with a prefix or a suffix, or without; nothing where there is none."""
+    option = "--joints" if wanted.role == "state" else "--command-joints"
+    for joint in missing:
+        for name in names:
+            short, long = sorted((joint, name), key=len)
+            if short and re.fullmatch(rf"(.*[\W_])?{re.escape(short)}([\W_].*)?", long):
+                return (
+                    f"; if {joint!r} is called {name!r} there, say so for each: {option} NAME={name}, where NAME is "
+                    "that in the MJCF"
+                )
+    return ""

@@ -44,12 +44,12 @@ _Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M
 def read_bags(
     paths: Sequence[str | os.PathLike[str]],
     *,
-    joints: Sequence[str],
+    joints: Sequence[str] | Mapping[str, str],
     slides: Sequence[str] = (),
     torque: TorqueConvention | None,
     state_topic: str = "/joint_states",
     command_topic: str | None = None,
-    command_joints: Sequence[str] | None = None,
+    command_joints: Sequence[str] | Mapping[str, str] | None = None,
     motors: Sequence[int] | None = None,
     velocity_actuators: Sequence[str] = (),
     effort_actuators: Sequence[str] = (),
@@ -66,7 +66,7 @@ def read_bags(
 
     The repeats are in the order of recording, or in that of `paths` where the bags' times overlap.
 
-    joints:            measured joints, in the order wanted.
+    joints:            measured joints, in the order wanted; a mapping gives each one's name in the messages.
     slides:            those of them that slide; a bag does not say.
     torque:            what the efforts are; a bag does not say.  None: they are not read.
     state_topic:       of a type in `bag_messages.STATES`.
@@ -74,7 +74,7 @@ def read_bags(
                        counts.  None reads a log without commands.  It may be the state topic, where
                        a message holds both.
     command_joints:    commanded joints, and the order of numbers in messages without names;
-                       `joints` by default.
+                       `joints` by default.  A mapping as there.
     motors:            places of the joints in messages without names that hold more of them, from 0.
     velocity_actuators, effort_actuators: names in the MJCF of the actuators, one per commanded joint,
                        that take the commands' set-points of velocity and effort.
@@ -91,8 +91,9 @@ def read_bags(
     increase, commands that differ between repeats, or bags without a common part.
     """
     bags = _bags(paths)
-    command_joints = tuple(joints if command_joints is None else command_joints)
-    asked = _asked(joints, slides, torque is not None, state_topic, command_topic, command_joints, motors)
+    sent = joints if command_joints is None else command_joints
+    asked = _asked(joints, slides, torque is not None, state_topic, command_topic, sent, motors)
+    joints, command_joints = tuple(joints), tuple(sent)
     extra = {"velocity": tuple(velocity_actuators), "effort": tuple(effort_actuators)}
     _check_actuators(extra, command_joints, command_topic)
     tracks = [read_bag(bag, asked) for bag in bags]
@@ -105,7 +106,7 @@ def read_bags(
     commands = [] if command_topic is None else [topics[COMMAND] for topics in timed]
     clock = _clock(states, rate, bags)
 
-    channels = _channels(states, clock, tuple(joints), slides, torque is not None, bags)
+    channels = _channels(states, clock, joints, slides, torque is not None, bags)
     command, command_names = np.zeros((0, 0)), ()
     _warn_of_rate(states[0][0], rate, bags[0])
     unused = _unused(commands, command_topic, extra)
@@ -224,12 +225,12 @@ def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
 
 
 def _asked(
-    joints: Sequence[str],
+    joints: Sequence[str] | Mapping[str, str],
     slides: Sequence[str],
     torque: bool,
     state_topic: str,
     command_topic: str | None,
-    command_joints: tuple[str, ...],
+    command_joints: Sequence[str] | Mapping[str, str],
     motors: Sequence[int] | None,
 ) -> dict[str, Wanted]:
     """What `read_bag` is asked for; torque: whether efforts are.  ValueError where slides are no joints."""
@@ -241,13 +242,18 @@ def _asked(
     shared = state_topic == command_topic
     needed = "effort" if torque else "position"
     own = None if place is None else tuple(place.values())
-    asked = {STATE: Wanted(state_topic, tuple(joints), needed, "state", own, shared)}
+    asked = {STATE: Wanted(state_topic, _in_messages(joints), needed, "state", own, shared)}
     if command_topic is None:
         return asked
     if place is not None and (unknown := [joint for joint in command_joints if joint not in place]):
         raise ValueError(f"motors say nothing of the commanded joints {', '.join(unknown)}, which are not measured")
     sent = None if place is None else tuple(place[joint] for joint in command_joints)
-    return {**asked, COMMAND: Wanted(command_topic, command_joints, "position", "command", sent, shared)}
+    return {**asked, COMMAND: Wanted(command_topic, _in_messages(command_joints), "position", "command", sent, shared)}
+
+
+def _in_messages(joints: Sequence[str] | Mapping[str, str]) -> tuple[str, ...]:
+    """Names of joints in the messages."""
+    return tuple(joints.values()) if isinstance(joints, Mapping) else tuple(joints)
 
 
 def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:

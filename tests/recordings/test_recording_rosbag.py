@@ -449,6 +449,26 @@ def test_joint_errors(tmp_path: Path, kind: str) -> None:
     fails([path], "expected 1 numbers (j1), got 2", command_topic="/command", command_joints=["j1"])
 
 
+def test_joints_that_messages_call_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Names with a prefix could not be matched to those of the MJCF."""
+    bag = Bag(tmp_path, "ros1")
+    for t in grid(0.0, 1.0):
+        for topic, prefix in {"/joint_states": "fr3_", "/goal": "fr3_", "/plain": "", "/plain_goal": ""}.items():
+            bag.state(t, topic=topic, names=tuple(f"{prefix}{joint}" for joint in JOINTS))
+    path = bag.write()
+    fails([path], "if 'j1' is called 'fr3_j1' there, say so for each: --joints NAME=fr3_j1, where NAME is that in")
+    fails([path], "no joint j2; ", "--joints NAME=fr3_j2", joints=("fr3_j1", "j2"))
+    found = read_bags([path], joints=["j1", "j2"], torque=TORQUE, state_topic="/plain", command_topic="/plain_goal")
+    said = ["--torque", "link", "--gravity", "--command-topic", "/goal", "--out", tmp_path / "door.npz"]
+    assert convert(path, "--joints", "j1=fr3_j1", "j2=fr3_j2", *said) == 0
+    assert load_recording(tmp_path / "door.npz").sha256 == found.sha256
+    other = ["--state-topic", "/plain", "--command-joints", "j2=fr3_j2", "j1=fr3_j1"]
+    assert convert(path, "--joints", *JOINTS, *other, *said) == 0
+    assert load_recording(tmp_path / "door.npz").command_names == ("j2", "j1")
+    assert convert(path, "--joints", "j1=fr3_j1", "j2=", *said) == 2
+    assert "expected joints as NAME or NAME=NAME_IN_THE_MESSAGES" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_effort_errors(tmp_path: Path, kind: str) -> None:
     bag = Bag(tmp_path, kind, "nan")
