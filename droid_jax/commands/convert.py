@@ -67,7 +67,7 @@ class Convert:
     stiffness: tuple[float, ...] = ()
     """Servo gains of the commanded joints, N m/rad (N/m for slides)."""
     damping: tuple[float, ...] = ()
-    """Servo damping of the commanded joints, N m s/rad (N s/m for slides)."""
+    """Servo damping of the commanded joints, N m s/rad (N s/m for slides); default: the scene's."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
     --joints."""
@@ -232,9 +232,10 @@ def _bag_options(command: Convert) -> dict[str, Any]:
 
     if not command.joints or command.torque is None:
         raise ValueError("a ROS bag does not say which joints to read or what its efforts are: give --joints, --torque")
-    if len(command.stiffness) != len(command.damping):
+    if command.damping and len(command.stiffness) != len(command.damping):
         raise ValueError(f"got {len(command.stiffness)} --stiffness and {len(command.damping)} --damping")
-    gains = ServoGains(np.array(command.stiffness), np.array(command.damping)) if command.stiffness else None
+    damping = np.array(command.damping) if command.damping else None
+    gains = ServoGains(np.array(command.stiffness), damping) if command.stiffness else None
     options = {
         "name": command.name or command.out.stem,
         "allow_jitter": command.allow_jitter,

@@ -83,7 +83,7 @@ class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, 
     powered: a column that is 0 (or false) where the motors are off, of the file that holds the command: the longest
         stretch in which they are on is read.
     side, gravity: of the torque, as in a recording.
-    stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad.
+    stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad; without damping the scene's counts.
     rate: Hz; with a column of time, of the common clock that everything is interpolated onto.
     units: of all channels.
     """
@@ -159,7 +159,7 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
         raise ValueError(f"{where}: rate must be above 0 and below 1e5 Hz, got {columns.rate:g}")
     if strange := [s for s in columns.slides if s not in columns.joints]:
         raise ValueError(f"{where}: slides must be among the joints, got {', '.join(strange)}")
-    if len(columns.stiffness) != len(columns.damping):
+    if columns.damping and len(columns.stiffness) != len(columns.damping):
         raise ValueError(f"{where}: got {len(columns.stiffness)} stiffness and {len(columns.damping)} damping")
     stamps = columns.stamps
     units = [] if stamps is None or stamps.unit is None else as_list(stamps.unit)

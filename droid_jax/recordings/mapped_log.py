@@ -76,6 +76,7 @@ def read_logs(
         command = one_command(values, time, command_names, command_tolerance, places)
     channels = {key: _channel(key, [r[key] for r in repeats], columns) for key in keys if key != "command"}
     side = TorqueSide(columns.side or "motor")
+    damping = np.array(columns.damping) if columns.damping else None
     recording = Recording(
         name=name,
         time=time,
@@ -83,7 +84,7 @@ def read_logs(
         command_names=command_names,
         channels=channels,
         torque=TorqueConvention(side, True if columns.gravity is None else columns.gravity),
-        gains=ServoGains(np.array(columns.stiffness), np.array(columns.damping)) if columns.stiffness else None,
+        gains=ServoGains(np.array(columns.stiffness), damping) if columns.stiffness else None,
         phases=tuple(phases),
         meta=_meta(places, _first(logs[0], columns), columns),
     )

@@ -51,7 +51,7 @@ class _Torque(msgspec.Struct, forbid_unknown_fields=True):
 
 class _Gains(msgspec.Struct, forbid_unknown_fields=True):
     stiffness: list[float]
-    damping: list[float]
+    damping: list[float] | None = None
 
 
 class _Pose(msgspec.Struct, forbid_unknown_fields=True):
@@ -103,7 +103,9 @@ def metadata_to_json(recording: Recording) -> str:
         "meta": dict(recording.meta),
     }
     if gains is not None:
-        meta["gains"] = {"stiffness": _floats(gains.stiffness), "damping": _floats(gains.damping)}
+        meta["gains"] = {"stiffness": _floats(gains.stiffness)}
+        if gains.damping is not None:
+            meta["gains"]["damping"] = _floats(gains.damping)
     if recording.known:
         meta["known"] = known_values(recording)
     if pose is not None:
@@ -136,7 +138,7 @@ def metadata_from_json(text: str, where: str) -> Metadata:
         columns={key: tuple(c.columns) for key, c in file.channels.items()},
         torque=TorqueConvention(file.torque.side, file.torque.gravity),
         qpos0=file.qpos0,
-        gains=None if file.gains is None else ServoGains(_array(file.gains.stiffness), _array(file.gains.damping)),
+        gains=None if file.gains is None else _gains(file.gains),
         known=file.known,
         phases=tuple(Phase(p.name, p.start, p.end) for p in file.phases),
         object_pose=None if file.object_pose is None else _pose(file.object_pose, where),
@@ -146,6 +148,10 @@ def metadata_from_json(text: str, where: str) -> Metadata:
 
 def _array(numbers: Any) -> np.ndarray:
     return np.array(numbers, dtype=np.float64)
+
+
+def _gains(gains: _Gains) -> ServoGains:
+    return ServoGains(_array(gains.stiffness), None if gains.damping is None else _array(gains.damping))
 
 
 def _pose(pose: _Pose, where: str) -> ObjectPose:

@@ -84,11 +84,12 @@ class Phase:
 class ServoGains:
     """The position servo's gains, one per command column.
 
-    stiffness: [U] N m/rad (N/m for slides); damping: [U] N m s/rad (N s/m for slides).
+    stiffness: [U] N m/rad (N/m for slides).
+    damping: [U] N m s/rad (N s/m for slides); None where it is not known: a replay has the scene's.
     """
 
     stiffness: np.ndarray
-    damping: np.ndarray
+    damping: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +331,9 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
         ],
         "torque": [recording.torque.side.value, bool(recording.torque.gravity)],
         "qpos0": {joint: float(q) for joint, q in recording.qpos0.items()},
-        "gains": None if gains is None else [_numbers(gains.stiffness), _numbers(gains.damping)],
+        "gains": None
+        if gains is None
+        else [_numbers(gains.stiffness), None if gains.damping is None else _numbers(gains.damping)],
         "phases": [[p.name, float(p.start), float(p.end)] for p in recording.phases],
         "object_pose": None
         if pose is None

@@ -92,7 +92,7 @@ def scale_gains(model: mujoco.MjModel, factors: np.ndarray) -> mujoco.MjModel:
 
 
 def stated_gains(scene: Scene, recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
-    """[U] stiffness and [U] damping of a recording's servos, the scene's where it commands none; None: it states none.
+    """[U] stiffness and [U] damping of a recording's servos, the scene's where it states none; None: it has no gains.
 
     Raises ValueError where the recording lacks a command that the scene needs.
     """
@@ -102,7 +102,8 @@ def stated_gains(scene: Scene, recording: Recording) -> tuple[np.ndarray, np.nda
     sent = np.flatnonzero(columns >= 0)
     stiffness, damping = own_stiffness(scene), own_damping(scene)
     stiffness[sent] = np.asarray(recording.gains.stiffness, dtype=float)[columns[sent]]
-    damping[sent] = np.asarray(recording.gains.damping, dtype=float)[columns[sent]]
+    if recording.gains.damping is not None:
+        damping[sent] = np.asarray(recording.gains.damping, dtype=float)[columns[sent]]
     return stiffness, damping
 
 
@@ -125,17 +126,22 @@ def gains_note(scene: Scene, recording: Recording) -> str:
     if not recording.command.size or (stated := stated_gains(scene, recording)) is None:
         return ""
     stiffness, damping = stated
-    own, servos = own_stiffness(scene), position_servos(scene.model)
-    rows = zip(scene.command_names, stiffness, own, _ratio(stiffness, own, servos), strict=True)
-    other = [f"{name} {here:g} in place of {has:g}" for name, here, has, factor in rows if factor != 1.0]
-    if not other:
+    other = _in_place(scene, stiffness, own_stiffness(scene))
+    damped = [f"damping of {text}" for text in _in_place(scene, damping, own_damping(scene))]
+    if not other and not damped:
         return ""
     ignored = _ignored_damping(scene, damping)
     said = f"; of {', '.join(ignored)} not the stated damping is used, but the joint's own" if ignored else ""
     return (
         f"the replay of recording {recording.name!r} has the servo gains that it states, not the scene's: "
-        f"{', '.join(other)}{said}"
+        f"{', '.join(other + damped)}{said}"
     )
+
+
+def _in_place(scene: Scene, stated: np.ndarray, own: np.ndarray) -> list[str]:
+    """Of each servo whose gain a replay scales: the stated one [U], and the scene's [U]."""
+    rows = zip(scene.command_names, stated, own, _ratio(stated, own, position_servos(scene.model)), strict=True)
+    return [f"{name} {here:g} in place of {has:g}" for name, here, has, factor in rows if factor != 1.0]
 
 
 def _ignored_damping(scene: Scene, stated: np.ndarray) -> list[str]:

@@ -50,8 +50,9 @@ def opened_further(scene: Scene, recording: Recording, replayed: Rollout) -> Rec
     command = longer.command.copy()
     columns = [recording.command_names.index(j) for j in scene.joints]
     command[:, columns] += step
-    if recording.gains is not None:  # a servo without a velocity reference stays behind by as much
-        lag = (recording.gains.damping / recording.gains.stiffness)[columns]
+    gains = recording.gains
+    if gains is not None and gains.damping is not None:  # a servo without a velocity reference stays behind by as much
+        lag = (gains.damping / gains.stiffness)[columns]
         command[:, columns] += lag * np.gradient(step, longer.time, axis=0)
     return replace(longer, command=command)
 

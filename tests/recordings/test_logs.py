@@ -654,6 +654,10 @@ def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["convert", str(path), "--out", str(out / "kp800.npz")]) == 0
     assert load_recording(out / "kp800.npz").gains is None
     assert "servo gains" not in capsys.readouterr().out
+    for target in (out / "stiff.npz", out / "stiff"):  # and damping that is not known is not stated
+        assert main(["convert", str(path), "--stiffness", "20", "30", "--out", str(target)]) == 0
+        gains = load_recording(target).gains
+        assert gains is not None and gains.stiffness.tolist() == [20.0, 30.0] and gains.damping is None
 
 
 def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -290,6 +290,7 @@ def test_hash_sees_every_part_of_the_content() -> None:
         replace(r, known={"payload": 0.3}),
         replace(r, known={"payload": "tool"}),
         replace(r, gains=replace(gains, damping=gains.damping * 2)),
+        replace(r, gains=replace(gains, damping=None)),
         replace(r, phases=r.phases[:1]),
         replace(r, object_pose=None),
         replace(r, object_pose=replace(pose, covariance=pose.covariance * 2)),

@@ -713,7 +713,7 @@ def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFix
     for arguments, expected in [
         (paths, "give --joints, --torque"),
         (paths[:1], "give --joints, --torque"),
-        ([*paths, *named, "--stiffness", "80", "40"], "got 2 --stiffness and 0 --damping"),
+        ([*paths, *named, "--damping", "2", "1"], "got 0 --stiffness and 2 --damping"),
         ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
         ([], "needs the files or folders to read"),
         ([paths[0], tmp_path / "gone.npz"], "gone.npz does not exist"),

@@ -32,7 +32,7 @@ from droid_jax.simulate.replay import (
     servo_replay,
     torque_offset_effect,
 )
-from droid_jax.simulate.servo_gains import gains_note
+from droid_jax.simulate.servo_gains import gains_note, servo_factors
 
 SPACE = Space(
     (time_offset(), *torque_offsets(JOINTS), joint_damping(arm(), "elbow", name="elbow_damping", std=0.1, high=50.0))
@@ -507,6 +507,21 @@ def test_a_stated_gain_stands_in_for_the_scenes(engine: str):
     assert np.abs(got.position - unstated.position).max() > 0.05
     note = gains_note(scene, stated)
     assert "shoulder 90 in place of 60" in note and "elbow 10 in place of 25" in note and not gains_note(scene, plain)
+    assert "damping of shoulder 3 in place of 1" in note  # which was not said
+
+
+def test_damping_that_is_not_stated_is_the_scenes():
+    """As many numbers as stiffnesses were demanded, and the 0 that stood for none switched the velocity gain off."""
+    spec = arm().spec.copy()
+    for actuator in spec.actuators:
+        actuator.biasprm[2] = -1.5
+    scene = compile_scene(spec, "damped", joints=JOINTS)
+    kp = np.array([60.0, 10.0])
+    drive = make_drive(scene, recording(gains=ServoGains(kp)))
+    np.testing.assert_allclose(servo_factors(scene, drive), [[10 / 25, 1.0], [1.0, 1.0]])  # elbow first
+    assert "damping" not in gains_note(scene, recording(gains=ServoGains(kp)))
+    off = gains_note(scene, recording(gains=ServoGains(np.array([60.0, 25.0]), np.array([0.0, 1.5]))))
+    assert "the scene's: damping of shoulder 0 in place of 1.5" in off
 
 
 def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
