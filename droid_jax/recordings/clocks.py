@@ -19,11 +19,12 @@ def check_clock(
     allow_jitter: bool = False,
     seconds: bool = True,
     label: Callable[[int], str] = lambda i: f"row {i}",
+    remedy: str = "",
 ) -> None:
     """ValueError unless time [T] is finite, in seconds, strictly increasing and regular.
 
     where: what the clock belongs to; seconds: whether its unit is in question; label: row index -> how the message
-    calls that row.
+    calls that row; remedy: for stamps that repeat, ends the message.
     """
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
@@ -32,9 +33,10 @@ def check_clock(
     bad = np.flatnonzero(steps <= 0)
     if bad.size:
         i = int(bad[0]) + 1
-        what = "repeats" if steps[i - 1] == 0 else "goes backwards:"
+        what, rest = ("repeats", f"; {remedy}" if remedy else "") if steps[i - 1] == 0 else ("goes backwards:", "")
         raise ValueError(
-            f"{where}, {label(i)}: time must increase, it {what} {float(time[i])!r} s after {float(time[i - 1])!r} s"
+            f"{where}, {label(i)}: time must increase, it {what} {float(time[i])!r} s after "
+            f"{float(time[i - 1])!r} s{rest}"
         )
     if seconds:
         _check_seconds(time, steps, where)

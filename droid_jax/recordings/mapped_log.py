@@ -212,7 +212,8 @@ def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: in
         parts.append((numbers, TIMES[unit or _usual_unit(numbers, f"{log.where}, time {shown(name)}")]))
     time = np.sum([(n - n[0]) * scale for n, scale in parts], axis=0)
     regular = allow_jitter or rate is not None
-    check_clock(time, f"{log.where}, time", allow_jitter=regular)
+    remedy = "where the rows have one rate, a map with that rate (--rate) and without time reads them by their number"
+    check_clock(time, f"{log.where}, time", allow_jitter=regular, remedy=remedy)
     # Several files of one log share an epoch: what was subtracted is added again, as far as a float64 holds it.
     return time + sum(float(n[0]) * scale for n, scale in parts)
 

@@ -293,7 +293,14 @@ def _timed(
         # Commands may pause while the robot holds still, or be waypoints seconds apart: their rate is not checked.
         state = key == STATE
         jitter = allow_jitter or not state
-        check_clock(time, where, allow_jitter=jitter, seconds=state, label=lambda i, n=track.numbers: f"message {n[i]}")
+        check_clock(
+            time,
+            where,
+            allow_jitter=jitter,
+            seconds=state,
+            label=lambda i, n=track.numbers: f"message {n[i]}",
+            remedy="--stamps bag (Stamps.BAG) takes the recorder's" if use_header else "",
+        )
         timed[key] = (time, track.fields)
     return timed
 

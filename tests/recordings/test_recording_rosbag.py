@@ -511,7 +511,10 @@ def test_stamps_must_increase(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "sqlite3")
     for t in (0.0, 0.01, 0.02, 0.02, 0.03):
         bag.state(t)
-    fails([bag.write()], "message 3", "header stamps", "time must increase, it repeats")
+    path = bag.write()
+    fails([path], "message 3", "header stamps", "time must increase, it repeats", "; --stamps bag (Stamps.BAG) takes")
+    with pytest.raises(ValueError, match=r"it repeats 0\.02 s after 0\.02 s$"):  # which nothing mends
+        read_bags([path], joints=JOINTS, torque=TORQUE, stamps=Stamps.BAG)
 
 
 @pytest.mark.parametrize("kind", KINDS)
