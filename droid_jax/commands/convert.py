@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -68,6 +68,9 @@ class Convert:
     """Servo gains of the commanded joints, N m/rad (N/m for slides)."""
     damping: tuple[float, ...] = ()
     """Servo damping of the commanded joints, N m s/rad (N s/m for slides); default: the scene's."""
+    known: tuple[str, ...] = ()
+    """What is known in this recording alone, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or the parameter
+    that stands for it there, e.g. payload=tool."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
     --joints."""
@@ -133,6 +136,8 @@ def run(command: Convert) -> None:
         first, last = recording.span
         start, end = command.start, command.end
         recording = recording.window(first if start is None else start, last if end is None else end)
+    if command.known:
+        recording = replace(recording, known={**recording.known, **_known(command.known)})
     path = save_recording(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
     repeats = "1 repeat" if recording.repeats == 1 else f"{recording.repeats} repeats"
@@ -202,6 +207,17 @@ def _joints(words: tuple[str, ...]) -> tuple[str, ...] | dict[str, str]:
         return words
     same = tuple(word if "=" in word else f"{word}={word}" for word in words)
     return _pairs(same, "joints as NAME or NAME=NAME_IN_THE_MESSAGES")
+
+
+def _known(words: tuple[str, ...]) -> dict[str, float | str]:
+    """--known as values and names."""
+    out: dict[str, float | str] = {}
+    for parameter, value in _pairs(words, "--known PARAMETER=VALUE, e.g. payload=0.5").items():
+        try:
+            out[parameter] = float(value)
+        except ValueError:
+            out[parameter] = value
+    return out
 
 
 def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:

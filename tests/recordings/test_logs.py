@@ -663,6 +663,17 @@ def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert gains is not None and gains.stiffness.tolist() == [20.0, 30.0] and gains.damping is None
 
 
+def test_what_is_known_of_one_log_is_stated_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "--units", "angle=rad", "--joints", *JOINTS]
+    out = tmp_path / "out" / "log.npz"
+    words = ["convert", str(log(tmp_path / "log.csv")), *said, "--out", str(out), "--known"]
+    assert main([*words, "payload=0.5", "rotor=second rotor"]) == 0
+    assert load_recording(out).known == {"payload": 0.5, "rotor": "second rotor"}
+    for word, said in (("payload", "expected --known PARAMETER=VALUE"), ("payload=nan", "known value of 'payload'")):
+        assert main([*words, word]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     first, second = log(tmp_path / "a.csv"), log(tmp_path / "b.csv", q9=POSITION[:, 0] + 0.1)
     said = ["--columns", "time=t", "command=cmd{n}", "position=q9,q10", "--units", "angle=rad", "--joints", *JOINTS]
