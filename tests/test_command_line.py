@@ -690,7 +690,7 @@ def test_a_negative_seed_is_refused(refused, command: list[str]):
 @pytest.mark.parametrize(("before", "kept"), [("gap", ()), ("identify", ("gap.json", "gaussian.json"))])
 def test_starting_over_forgets_another_commands_results(tmp_path: Path, before: str, kept: tuple[str, ...]):
     """Of the same command its own are forgotten alone, in a folder of several; what judged the fit goes with it."""
-    for name in ("gap.json", "gaussian.json", "config.json", "evaluation.json", "notes.txt"):
+    for name in ("gap.json", "gaussian.json", "gaussian_full.json", "config.json", "evaluation.json", "notes.txt"):
         (tmp_path / name).write_text("{}")
     # identify's own names no command
     (tmp_path / "setup.json").write_text(json.dumps({} if before == "identify" else {"command": before}))

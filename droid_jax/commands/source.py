@@ -10,7 +10,15 @@ from droid_jax.commands.synthetic import known_robot
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
-from droid_jax.report.stages import described_in, extended_of, left_over, needs_whole, setup, unfinished
+from droid_jax.report.stages import (
+    described_in,
+    extended_of,
+    gaussian_of,
+    left_over,
+    needs_whole,
+    setup,
+    unfinished,
+)
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -40,7 +48,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
         raise ValueError(f"{folder} was fitted with the paper's stiff servo: train on a fit of another preset")
     if other.get("scene"):
         raise ValueError(f"{folder} was fitted in {other['scene']}: policies are trained in the built-in scene")
-    at, model = folder / GAUSSIAN, extended_of(folder)
+    at, model = gaussian_of(folder), extended_of(folder)
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
@@ -95,7 +103,7 @@ def has_model(folder: Path) -> bool:
     """Whether there is something in a folder that a policy can be trained on."""
     if unfinished(folder):
         return False
-    return (folder / GAUSSIAN).is_file() or extended_of(folder) is not None
+    return gaussian_of(folder).is_file() or extended_of(folder) is not None
 
 
 def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:
