@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from droid_jax import distributed
 from droid_jax.commands import evaluate, gap, identify, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.options import (
@@ -180,6 +181,15 @@ def _stages(command: All) -> tuple[Stage, ...]:
         why = "" if command.scene is None else " with --scene: policies are trained at the built-in door"
         raise ValueError(f"--stages must name one of {', '.join(possible)}{why}")
     return left
+
+
+def needs_one_process(command: All) -> None:
+    """ValueError where several processes would train: brax takes the devices of all of them."""
+    if distributed.count() > 1 and "train" in _stages(command):
+        raise ValueError(
+            "a policy is trained by one process: give --stages identify gap, then train in one process "
+            f"(without {distributed.VARIABLE})"
+        )
 
 
 def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
