@@ -40,7 +40,7 @@ class TrainConfig:
     """Settings of PPO; the defaults are the preset "quick".
 
     steps: actions in all, over all environments, rounded up to whole rounds.  envs: environments at once, over all
-    devices.  devices: how many; None for the most that divide the environments.
+    devices.  devices: how many; None for the most that divide the environments and the batch.
     hidden: sizes of the hidden layers of actor and critic.
     learning_rate, discount, gae, clip, entropy, reward_scaling: of PPO.
     unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
@@ -169,14 +169,18 @@ def train(
 
 
 def _devices(config: TrainConfig) -> int:
-    """How many devices to use; ValueError where they are not there or do not divide the environments."""
+    """How many devices to use; ValueError where they are not there or do not divide environments and batch.
+
+    brax cuts the unrolls of each device into as many minibatches as of all.
+    """
     there = jax.local_device_count()
     if config.devices is None:
-        return max(d for d in range(1, there + 1) if config.envs % d == 0)
+        return max(d for d in range(1, there + 1) if config.envs % d == config.batch % d == 0)
     if not 1 <= config.devices <= there:
         raise ValueError(f"{config.devices} devices were asked for, there are {there}")
-    if config.envs % config.devices:
-        raise ValueError(f"{config.envs} environments do not divide among {config.devices} devices")
+    for count, what in ((config.envs, "environments"), (config.batch, "unrolls of a minibatch")):
+        if count % config.devices:
+            raise ValueError(f"{count} {what} do not divide among {config.devices} devices")
     return config.devices
 
 

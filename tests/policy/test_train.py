@@ -88,13 +88,17 @@ def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch
     assert _devices(SHORT) == 4
     with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
         _devices(replace(SHORT, devices=5))
+    monkeypatch.setattr(jax, "local_device_count", lambda: 16)
+    with pytest.raises(ValueError, match="8 unrolls of a minibatch do not divide among 16 devices"):
+        _devices(replace(SHORT, devices=16))
 
 
-@pytest.mark.parametrize("devices", [1, 2, 4, 8])
+@pytest.mark.parametrize("devices", [1, 2, 4, 8, 64, 128])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, devices: int):
+    """As many as the batch has unrolls: on 64 cores brax could not divide the batch of "quick"."""
     monkeypatch.setattr(jax, "local_device_count", lambda: devices)
-    assert _devices(PRESETS[preset]) == devices
+    assert _devices(PRESETS[preset]) == min(devices, PRESETS[preset].batch)
 
 
 def test_the_time_left_is_what_the_rest_takes_at_this_rate():
