@@ -104,8 +104,8 @@ class TrainProgress:
     """After each evaluation.
 
     step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
-    of the last part; reward: of an episode; success, blown_up: share of episodes, the latter of those that ended
-    because the simulation was no longer one.
+    of the last part, its evaluation included; reward: of an episode; success, blown_up: share of episodes, the latter
+    of those that ended because the simulation was no longer one.
     """
 
     step: int
@@ -119,7 +119,7 @@ class TrainProgress:
     @property
     def left(self) -> float:
         """s that the rest will take at this rate; infinite before the first part."""
-        return (self.of - self.step) / self.rate if self.rate > 0 else float("inf")
+        return max(0, self.of - self.step) / self.rate if self.rate > 0 else float("inf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,11 +201,12 @@ def _brax(
 
     def tell(step: int, metrics: dict[str, Any]) -> None:
         nonlocal best
+        seconds = time.monotonic() - began
         now = TrainProgress(
             step=done + step,
             of=config.steps,
-            seconds=time.monotonic() - began,
-            rate=float(metrics.get("training/sps", 0.0)),
+            seconds=seconds,
+            rate=(done + step - history[-1].step) / (seconds - history[-1].seconds) if step else 0.0,
             reward=float(metrics["eval/episode_reward"]),
             success=float(metrics["eval/episode_success"]),
             blown_up=float(metrics["eval/episode_blown_up"]),

@@ -104,6 +104,7 @@ def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, d
 def test_the_time_left_is_what_the_rest_takes_at_this_rate():
     now = TrainProgress(step=1000, of=4000, seconds=9.0, rate=0.0, reward=0.0, success=0.0)
     assert replace(now, rate=150.0).left == 20.0 and now.left == float("inf")
+    assert replace(now, rate=150.0, step=4096).left == 0.0  # whole rounds may be more than was asked for
 
 
 def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:
@@ -134,6 +135,15 @@ def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: 
     found = _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
     assert found.policy == 2.0
     assert [(now.step, now.blown_up) for now in found.history] == [(0, 0.25), (100, 0.25), (200, 0.25), (300, 0.25)]
+
+
+def test_the_rate_counts_the_evaluations_too(monkeypatch: pytest.MonkeyPatch):
+    """The time left was that of the training alone, as brax gives it."""
+    played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.0, 5.0, 1.0), (300, 0.0, 8.0, 2.0))
+    clock = iter([2.0, 12.0, 32.0, 52.0])
+    monkeypatch.setattr("droid_jax.policy.train.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    found = _brax(MADE_UP, None, replace(SHORT, steps=400), None, 0, lambda now: None, lambda step, tree: None)
+    assert [(now.rate, now.left) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
 
 
 @pytest.mark.parametrize("evaluations", [2, 8, 16])
