@@ -10,6 +10,7 @@ import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx wit
 # isort: split
 import contextlib
 import functools
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -311,8 +312,13 @@ def _blank(env: Environment, config: TrainConfig) -> Any:
 
 
 def evaluations_left(config: TrainConfig, steps: int) -> int:
-    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long."""
-    return max(2, 1 + round((config.evaluations - 1) * steps / config.steps))
+    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long.
+
+    Parts are whole rounds, all of as many: so many evaluations that these are hardly more than were asked for.
+    """
+    rounds = math.ceil(steps / (config.batch * config.minibatches * config.unroll))
+    parts = max(1, round((config.evaluations - 1) * steps / config.steps))
+    return 1 + math.ceil(rounds / math.ceil(rounds / parts))
 
 
 def _rank(now: TrainProgress) -> tuple[float, float]:

@@ -155,6 +155,22 @@ def test_a_run_that_was_stopped_has_as_many_evaluations_as_one_that_was_not(eval
     assert evaluations_left(config, 1) == 2
 
 
+@pytest.mark.parametrize(("asked", "rounds"), [(20_000, 5), (70_000, 18), (4_000_000, 15 * 66)])
+def test_actions_are_rounded_up_to_whole_rounds(asked: int, rounds: int):
+    """A round for each of 15 evaluations were three times 20,000 actions; and a resumed run ended earlier."""
+    config = TrainConfig(steps=asked)
+    one = config.batch * config.minibatches * config.unroll
+    parts = evaluations_left(config, asked) - 1
+    part = -(-asked // (parts * one)) * one  # brax's
+    assert parts * part == rounds * one
+    assert evaluations_left(config, asked - part) - 1 == parts - 1  # where it was stopped after the first
+
+
+@pytest.mark.parametrize("preset", PRESETS.values())
+def test_presets_have_the_evaluations_that_they_say(preset: TrainConfig):
+    assert evaluations_left(preset, preset.steps) == preset.evaluations
+
+
 def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkeypatch: pytest.MonkeyPatch):
     untrained, good, none = (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0), (200, 0.0, np.nan, np.nan)
     ran = played(monkeypatch, untrained, good, none, (300, 1.0, 1.0, 3.0))
