@@ -106,7 +106,8 @@ class TrainProgress:
 
     step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
     of the last part, its evaluation included; reward: of an episode; success, blown_up: share of episodes, the latter
-    of those that ended because the simulation was no longer one.
+    of those that ended because the simulation was no longer one.  These count as failures here, and in no rate of
+    `Trials`: no policy shall be the best for the few episodes that it left whole.
     """
 
     step: int
