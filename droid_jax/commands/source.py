@@ -106,6 +106,17 @@ def has_model(folder: Path) -> bool:
     return gaussian_of(folder).is_file() or extended_of(folder) is not None
 
 
+def untrainable(folder: Path) -> tuple[str, ...]:
+    """Effects of a folder's extended model that no policy can be trained with: `DoorEnv` has no whole command yet."""
+    from droid_jax.door.scene import door_scene
+    from droid_jax.identify.extended_model import load_extended
+
+    model = extended_of(folder)
+    if model is None or not model.is_file():
+        return ()
+    return tuple(effect.name for effect in load_extended(model, door_scene()).effects if effect.profile is not None)
+
+
 def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:
     """Which synthetic robot a fit was made of, if it was one: its springs, seed and hidden effects."""
     known = {} if folder is None else setup(folder)
