@@ -85,6 +85,13 @@ def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
         source(fit(tmp_path, scene, preset="quick", scene="own.xml"), knob=0)
 
 
+def test_a_fit_with_effects_of_the_library_is_refused(scene, tmp_path: Path):
+    """It was said to be of another scene."""
+    fit(tmp_path, scene, effects=["latch"])
+    with pytest.raises(ValueError, match=r"with --effects latch, .*a folder of `gap`, or on a fit with --extended"):
+        source(tmp_path, knob=0)
+
+
 def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene, tmp_path: Path):
     """Its entries exist in the door's model too, and mean other joints there."""
     fit(tmp_path, scene)

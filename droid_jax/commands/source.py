@@ -52,6 +52,11 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
+        if other.get("effects"):
+            raise ValueError(
+                f"{folder} was fitted with --effects {' '.join(other['effects'])}, which no extended model brings: "
+                "train on a folder of `gap`, or on a fit with --extended"
+            )
         own = load_gaussian(at)
         _check_door(at, own, scene)
         return scene, own, ()

@@ -31,6 +31,7 @@ class Setup(TypedDict, total=False):
     recording: list[str]
     scene: str | None
     extended: str | None
+    effects: list[str]
     user_effects: str | None
     fit: str | None
     fit_sha256: str | None
