@@ -406,7 +406,10 @@ def test_the_same_name_twice(refused, tmp_path: Path):
 
 
 @pytest.mark.parametrize("command", ["all", "identify", "gap"])
-@pytest.mark.parametrize("option", [("--parameters", "p.json"), ("--joints", "elbow"), ("--object-joint", "lid")])
+@pytest.mark.parametrize(
+    "option",
+    [("--parameters", "p.json"), ("--joints", "elbow"), ("--object-joint", "lid"), ("--joint-friction", "scene")],
+)
 def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: str, option: tuple[str, str]):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
     assert f"{option[0]} is for a scene of your own: give --scene too" in said
