@@ -90,7 +90,8 @@ def measured(arguments: Arguments) -> dict[str, Any]:
     save_policy(left / POLICY, found.policy)
     gaussian.save(left / GAUSSIAN)
     physics = round(env.task.control / TIMESTEP)  # steps of the simulation in an action
-    rates = [now.rate for now in found.history[2:]] or [found.history[-1].rate]  # the first part compiles
+    # Evaluations included, which brax's own rate leaves out; the first part compiles.
+    rates = [now.rate for now in found.history[2:]] or [found.history[-1].rate]
     reached = [now for now in found.history if now.success >= ENOUGH]
     robot = synthetic_robot(
         door_scene(limits=True), env.start, synthetic_truth(door_scene(), *TRUTH), (), env.task,

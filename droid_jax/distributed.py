@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 
 VARIABLE = "DROID_JAX_DISTRIBUTED"
 COORDINATOR, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
+RANKS = (INDEX, "SLURM_PROCID", "OMPI_COMM_WORLD_RANK")  # where a launcher says which process this is
 HEARTBEAT = 15  # s without a sign of life after which a process counts as lost
 JOINING = 300  # s to wait for all processes
-LEAVING = 7 * 24 * 3600  # s that a process waits at its end for the others: process 0 may train meanwhile
+LEAVING = 7 * 24 * 3600  # s that a process waits at its end for the others: process 0 may try a policy meanwhile
 _LEFT_OUT = (LOCK, "films", "figures", "frames", "tensorboard", "report.html")  # of a folder's copy: nobody reads them
 _AGAIN = "the same command goes on from its last checkpoint, with fewer processes too"
 _place = [0, 1]  # index of this process, and how many there are
@@ -64,6 +65,11 @@ def count() -> int:
 def first() -> bool:
     """Whether this process is the one that writes, draws and prints."""
     return index() == 0
+
+
+def rank() -> int:
+    """Number of this process as its launcher says it, whether it has met the others or not; 0 where none says it."""
+    return next((number for name in RANKS if (number := _number(name)) is not None), 0)
 
 
 def join() -> None:

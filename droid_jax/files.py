@@ -2,6 +2,7 @@
 
 SETUP, CONFIG, FIT = "setup.json", "config.json", "fit.json"
 GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"
+FULL_GAUSSIAN = "gaussian_full.json"  # with the nuisances
 TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distribution.npz"
 HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
@@ -27,7 +28,7 @@ SYNTHETIC_SOURCE = "synthetic robot (plain C MuJoCo), not a real one"  # in the 
 LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
 # What else is in them that would be taken for the next run's.
 RESULTS = {
-    "identify": (FIT, GAUSSIAN, EXTENDED),
+    "identify": (FIT, GAUSSIAN, FULL_GAUSSIAN, EXTENDED),
     "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF, "extended.patch", "extended_parts", *NEUTRAL),
     "train": (POLICY, TRANSFER, EXTENDED, FILMS, "export"),
 }
@@ -38,7 +39,7 @@ WRITTEN: dict[str, tuple[str, ...]] = {
     stage: (SETUP, last, *RESULTS[stage], "report.html", "figures", "checkpoints", "tensorboard")
     for stage, last in LAST_FILES.items()
 }
-WRITTEN["identify"] += ("gaussian_full.json", SAMPLES, TRACES, CORRELATION, DISTRIBUTION, HISTORY, HISTORY_TABLE)
+WRITTEN["identify"] += (SAMPLES, TRACES, CORRELATION, DISTRIBUTION, HISTORY, HISTORY_TABLE)
 WRITTEN["identify"] += (FITTED, "fitted.patch", "fitted_parts", *NEUTRAL, REPLAY, FILMS, "frames", VIEWER)
 WRITTEN["train"] += (GAUSSIAN,)
 WRITTEN["all"] = (ASKED, "report.html")

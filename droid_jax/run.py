@@ -129,25 +129,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run_together(command: Any) -> None:
-    """Run a command in several processes (`distributed`)."""
+    """Run a command in several processes (`distributed`).
+
+    One that they do not share is the first's, which does not meet the others: a replay would wait for them, and brax
+    would train on the devices of all.
+    """
     from droid_jax import runtime
 
+    if not isinstance(command, SHARED):
+        if distributed.rank() == 0:
+            _ACTIONS[type(command)](command)
+        return
     if not distributed.count() > 1:
         runtime.tune()
         distributed.join()
-    with distributed.part(command.out if isinstance(command, SHARED) else None) as folder:
+    if isinstance(command, all_stages.All):
+        all_stages.needs_one_process(command)
+    with distributed.part(command.out) as folder:
         if (own := _own_part(command, folder)) is not None:
             _ACTIONS[type(own)](own)
 
 
 def _own_part(command: Any, folder: Path | None) -> Any:
-    """What this process does of a command: all where batches are replayed, else nothing, unless it is the first."""
+    """What this process does of a shared command: all where batches are replayed, else nothing, unless it is the
+    first.
+    """
     if distributed.first():
         return command
     if isinstance(command, all_stages.All):
         stages = tuple(stage for stage in command.stages if stage in all_stages.IN_A_SCENE)
         return dataclasses.replace(command, out=folder, stages=stages) if stages else None
-    return dataclasses.replace(command, out=folder) if isinstance(command, SHARED) else None
+    return dataclasses.replace(command, out=folder)
 
 
 def _given(arguments: list[str]) -> list[str]:

@@ -406,7 +406,10 @@ def test_the_same_name_twice(refused, tmp_path: Path):
 
 
 @pytest.mark.parametrize("command", ["all", "identify", "gap"])
-@pytest.mark.parametrize("option", [("--parameters", "p.json"), ("--joints", "elbow"), ("--object-joint", "lid")])
+@pytest.mark.parametrize(
+    "option",
+    [("--parameters", "p.json"), ("--joints", "elbow"), ("--object-joint", "lid"), ("--joint-friction", "scene")],
+)
 def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: str, option: tuple[str, str]):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
     assert f"{option[0]} is for a scene of your own: give --scene too" in said
@@ -690,7 +693,7 @@ def test_a_negative_seed_is_refused(refused, command: list[str]):
 @pytest.mark.parametrize(("before", "kept"), [("gap", ()), ("identify", ("gap.json", "gaussian.json"))])
 def test_starting_over_forgets_another_commands_results(tmp_path: Path, before: str, kept: tuple[str, ...]):
     """Of the same command its own are forgotten alone, in a folder of several; what judged the fit goes with it."""
-    for name in ("gap.json", "gaussian.json", "config.json", "evaluation.json", "notes.txt"):
+    for name in ("gap.json", "gaussian.json", "gaussian_full.json", "config.json", "evaluation.json", "notes.txt"):
         (tmp_path / name).write_text("{}")
     # identify's own names no command
     (tmp_path / "setup.json").write_text(json.dumps({} if before == "identify" else {"command": before}))

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.distributed import ROOT, SEARCH, finish, largest_difference, largest_shift, lose
-from droid_jax import distributed
+from droid_jax import distributed, run
+from droid_jax.commands.all_stages import All, needs_one_process
 
 PART = """
 import json, os, sys
@@ -109,6 +110,33 @@ def test_a_number_that_is_none_is_told(refused, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv(distributed.VARIABLE, "1")
     monkeypatch.setenv(distributed.INDEX, "two")
     assert "JAX_PROCESS_ID must be a whole number, got 'two'" in refused("identify", "--scene", "nothing.xml")
+
+
+@pytest.mark.parametrize("launcher", distributed.RANKS)
+@pytest.mark.parametrize("arguments", ["train", "rehearse", "evaluate-fit --recording a.npz"])
+def test_what_is_not_shared_is_done_by_the_first_process_alone(monkeypatch, launcher: str, arguments: str) -> None:
+    """It met the others, who did nothing: brax failed or hung, and so did replays that all were to share."""
+    did = list[str]()
+    actions = dict.fromkeys(run._ACTIONS, lambda command: did.append(os.environ[launcher]))
+    monkeypatch.setattr(run, "_ACTIONS", actions)
+    monkeypatch.setattr(distributed, "join", lambda: pytest.fail("it waits for the other processes"))
+    monkeypatch.setenv(distributed.VARIABLE, "1")
+    for name in distributed.RANKS:
+        monkeypatch.delenv(name, raising=False)
+    for number in "01":
+        monkeypatch.setenv(launcher, number)
+        assert run.main(arguments.split()) == 0
+    assert did == ["0"]
+
+
+def test_several_processes_do_not_train(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They found it out after hours of search, where brax hung or failed."""
+    needs_one_process(All())  # of one
+    monkeypatch.setattr(distributed, "_place", [0, 2])
+    with pytest.raises(ValueError, match="give --stages identify gap, then train in one process"):
+        needs_one_process(All())
+    needs_one_process(All(stages=("identify", "gap")))
+    needs_one_process(All(scene=Path("own.xml")))  # in which none is trained
 
 
 @pytest.mark.slow

@@ -20,6 +20,10 @@ from droid_jax.commands.options import TIMESTEP
 from droid_jax.commands.source import synthetic_robot_of
 from droid_jax.commands.synthetic import known_robot
 from droid_jax.door.scene import door_scene
+from droid_jax.identify.extended_model import Extended, save_extended
+from droid_jax.identify.gaussian import prior
+from droid_jax.model.effects.candidate import Candidate
+from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.report import page
@@ -159,6 +163,21 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
     assert (
         "gap: The model lacks: latch; 70 % of the discrepancy U closed on the test recording" in capsys.readouterr().out
     )
+
+
+def test_where_no_policy_can_be_trained_the_run_ends_with_the_search(called, tmp_path: Path, capsys):
+    """It ended with an error of the environment, after the search."""
+    scene, folder = door_scene(), tmp_path / "runs" / "all" / "gap"
+    effects = library(scene, ("profile_acceleration",))
+    location, names = next(iter(effects[0].locations.items()))
+    space = effect_space(effects).select(names)
+    found(folder, [effects[0].name])
+    part = Candidate(effects[0].name, location, names, {})
+    save_extended(folder, Extended(ready(scene), (part,), effects, space.mean, prior(space)))
+    assert main([]) == 0
+    assert [type(command) for command in called] == [identify.Identify, gap.GapCommand]
+    said = capsys.readouterr().out
+    assert "no policy can be trained with profile_acceleration" in said and "report: runs/all/report.html" in said
 
 
 @pytest.mark.parametrize("synthetic_robot", [True, False])
@@ -324,6 +343,8 @@ def test_what_no_policy_can_be_tried_with_is_said_at_once(called, capsys):
     assert "hidden effects sensor_delay change whole traces" in said and "--stages identify gap train" in said
     assert main(["all", "--seed", "-1"]) == 2
     assert "--seed must not be negative" in capsys.readouterr().err
+    assert main(["all", "--hide", "inner_profile=0.1"]) == 2  # nor be trained
+    assert capsys.readouterr().err.strip().endswith("--stages identify gap")
     assert called == [] and not Path("runs/all/all.json").exists()  # the corrected command is no other run
     assert main(["all", "--hide", "sensor_delay=0.01", "--stages", "identify", "gap"]) == 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,7 @@ from droid_jax.policy.trials import BLOWN_UP, Trials
 from droid_jax.report import page
 from droid_jax.report.policy_folder import Trained, Training, Transfer
 from droid_jax.report.render import NoOpenGL
-from droid_jax.report.stages import extended_of
+from droid_jax.report.stages import extended_of, fingerprint
 from droid_jax.run import main
 
 pytestmark = pytest.mark.usefixtures("tuned")
@@ -66,11 +67,29 @@ def test_a_fit_brings_its_gaussian_and_its_synthetic_robot(scene, tmp_path: Path
     assert synthetic_robot_of(fit(tmp_path, scene, springs=1, recording=["own.npz"])) == {}
 
 
+def test_a_policy_meets_the_nuisances_of_its_fit(scene, tmp_path: Path):
+    """They were left out: where the door stands and what the links weigh stayed nominal in training."""
+    without = fingerprint(fit(tmp_path, scene))
+    full = prior(door_space(scene) + door_nuisances(scene))
+    full = replace(full, mean=np.full(len(full.space), 0.1))
+    full.save(tmp_path / "gaussian_full.json")
+    _, gaussian, _ = source(tmp_path, knob=1)
+    assert gaussian.space.names == full.space.names and fingerprint(tmp_path) != without
+    np.testing.assert_array_equal(gaussian.mean, full.mean)
+
+
 def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
     with pytest.raises(ValueError, match="fitted with the paper's stiff servo"):
         source(fit(tmp_path, scene, preset="paper", generations=None), knob=0)
     with pytest.raises(ValueError, match=r"was fitted in own.xml: policies are trained in the built-in scene"):
         source(fit(tmp_path, scene, preset="quick", scene="own.xml"), knob=0)
+
+
+def test_a_fit_with_effects_of_the_library_is_refused(scene, tmp_path: Path):
+    """It was said to be of another scene."""
+    fit(tmp_path, scene, effects=["latch"])
+    with pytest.raises(ValueError, match=r"with --effects latch, .*a folder of `gap`, or on a fit with --extended"):
+        source(tmp_path, knob=0)
 
 
 def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene, tmp_path: Path):

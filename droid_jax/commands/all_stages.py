@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from droid_jax import distributed
 from droid_jax.commands import evaluate, gap, identify, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.options import (
@@ -21,7 +22,7 @@ from droid_jax.commands.options import (
     needs_scene,
     recording_at,
 )
-from droid_jax.commands.source import model_folder, needs_brax
+from droid_jax.commands.source import model_folder, needs_brax, untrainable
 from droid_jax.commands.synthetic import DEMONSTRATIONS, hidden_effects, kept_at, record_synthetic, with_robot_options
 from droid_jax.commands.writer import writes
 from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
@@ -182,15 +183,28 @@ def _stages(command: All) -> tuple[Stage, ...]:
     return left
 
 
+def needs_one_process(command: All) -> None:
+    """ValueError where several processes would train: brax takes the devices of all of them."""
+    if distributed.count() > 1 and "train" in _stages(command):
+        raise ValueError(
+            "a policy is trained by one process: give --stages identify gap, then train in one process "
+            f"(without {distributed.VARIABLE})"
+        )
+
+
 def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
     """Record where nothing was recorded, then the stages that were asked for; each says how long it took.
 
-    Where one fails, the page of those before it is written.
+    Where one fails, the page of those before it is written.  Where the search found an effect that no policy can be
+    trained with, they end with it.
     """
     plan = _plan(command, out, command.recording or kept_at(out), roles)
     if _records(command):
         plan = {"record": lambda: _record(command), **plan}
     for number, (stage, run_stage) in enumerate(plan.items(), 1):
+        if stage == "train" and "gap" in plan and (unfit := untrainable(model_folder(out))):
+            print(f"\nno policy can be trained with {', '.join(unfit)}, which needs a whole command: the run ends here")
+            return
         began = time.monotonic()
         print(f"\n[{number}/{len(plan)}] {stage}{_left(command, list(plan)[number - 1 :])}", flush=True)
         try:
@@ -229,10 +243,12 @@ def _needs_robot(command: All) -> None:
         from droid_jax.synthetic.hidden_effects import as_applied
         from droid_jax.synthetic.policy_trials import check_playable
 
+        applied = as_applied(hidden)
         try:
-            check_playable(scene, as_applied(hidden))
+            check_playable(scene, applied)
         except ValueError as error:
-            raise ValueError(f"{error}; or leave the trials away: --stages identify gap train") from None
+            left = "identify gap" if "inner_profile" in {one.name for one in applied} else "identify gap train"
+            raise ValueError(f"{error}; or leave the trials away: --stages {left}") from None
 
 
 def _roles(command: All) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from droid_jax.commands.folder import PATHS
-from droid_jax.files import CONFIG, EXTENDED, FIT, GAP
+from droid_jax.files import CONFIG, EXTENDED, FIT, FULL_GAUSSIAN, GAP
 from droid_jax.read_json import read_json
 from droid_jax.recordings.split import Split
 from droid_jax.report.stages import needs_whole, setup
@@ -82,10 +82,10 @@ def _identified(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitt
 
     own = folder / EXTENDED
     command = replace(_command(Identify, asked), extended=own if own.is_file() else None)
-    fit, space = read_fit(folder), load_gaussian(folder / "gaussian_full.json").space
+    fit, space = read_fit(folder), load_gaussian(folder / FULL_GAUSSIAN).space
     known = {p.name: p for p in fit.parameters}
     if absent := [name for name in space.names if name not in known]:
-        raise ValueError(f"{folder / FIT} lacks {', '.join(absent)} of gaussian_full.json: they are of two runs")
+        raise ValueError(f"{folder / FIT} lacks {', '.join(absent)} of {FULL_GAUSSIAN}: they are of two runs")
     scene, effects = effects_in(command, _scene_of(asked, given, _rubbed(space.parameters)))
     _check_same(folder, asked, scene, given)
     return Fitted(

@@ -80,8 +80,9 @@ class OwnScene(Protocol):
 
 def needs_scene(options: OwnScene) -> None:
     """ValueError for options that describe a scene of your own where none is given."""
-    for name in ("parameters", "joints", "object_joint"):
-        if options.scene is None and getattr(options, name):
+    given = {name: getattr(options, name) for name in ("parameters", "joints", "object_joint")}
+    for name, value in {**given, "joint_friction": options.joint_friction != "held"}.items():
+        if options.scene is None and value:
             raise ValueError(f"--{name.replace('_', '-')} is for a scene of your own: give --scene too")
 
 

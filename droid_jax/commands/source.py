@@ -10,7 +10,15 @@ from droid_jax.commands.synthetic import known_robot
 from droid_jax.errors import needs
 from droid_jax.files import CONFIG, GAP, GAUSSIAN
 from droid_jax.read_json import read_json, typed
-from droid_jax.report.stages import described_in, extended_of, left_over, needs_whole, setup, unfinished
+from droid_jax.report.stages import (
+    described_in,
+    extended_of,
+    gaussian_of,
+    left_over,
+    needs_whole,
+    setup,
+    unfinished,
+)
 
 if TYPE_CHECKING:
     from droid_jax.identify.gaussian import Gaussian
@@ -40,10 +48,15 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
         raise ValueError(f"{folder} was fitted with the paper's stiff servo: train on a fit of another preset")
     if other.get("scene"):
         raise ValueError(f"{folder} was fitted in {other['scene']}: policies are trained in the built-in scene")
-    at, model = folder / GAUSSIAN, extended_of(folder)
+    at, model = gaussian_of(folder), extended_of(folder)
     if model is None:
         if not at.is_file():
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
+        if other.get("effects"):
+            raise ValueError(
+                f"{folder} was fitted with --effects {' '.join(other['effects'])}, which no extended model brings: "
+                "train on a folder of `gap`, or on a fit with --extended"
+            )
         own = load_gaussian(at)
         _check_door(at, own, scene)
         return scene, own, ()
@@ -95,7 +108,18 @@ def has_model(folder: Path) -> bool:
     """Whether there is something in a folder that a policy can be trained on."""
     if unfinished(folder):
         return False
-    return (folder / GAUSSIAN).is_file() or extended_of(folder) is not None
+    return gaussian_of(folder).is_file() or extended_of(folder) is not None
+
+
+def untrainable(folder: Path) -> tuple[str, ...]:
+    """Effects of a folder's extended model that no policy can be trained with: `DoorEnv` has no whole command yet."""
+    from droid_jax.door.scene import door_scene
+    from droid_jax.identify.extended_model import load_extended
+
+    model = extended_of(folder)
+    if model is None or not model.is_file():
+        return ()
+    return tuple(effect.name for effect in load_extended(model, door_scene()).effects if effect.profile is not None)
 
 
 def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:

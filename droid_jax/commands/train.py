@@ -27,7 +27,7 @@ Method = Literal["fitted", "mean", "prior"]
 class Train:
     """Train a policy with PPO on doors drawn from a Gaussian: the fitted one, or the prior.
 
-    With --fit it is the Gaussian that `identify` fitted, or the extended model that `gap` found.
+    With --fit it is the Gaussian that `identify` fitted, nuisances included, or the extended model that `gap` found.
     """
 
     fit: Path | None = None

@@ -194,7 +194,7 @@ class DoorEnv(Environment):
             return world.commands[jnp.clip(PAST - 1 - back.astype(jnp.int32), 0, PAST - 1)]
 
         for effect in self.effects:
-            if effect.command is not None:
+            if effect.command is not None and not effect.over_time:  # no recording runs, nor its clock
                 look = compose(effect.command, theta, look)
         return servo_input(look(now.time), theta, now, self.effects)
 

@@ -26,6 +26,7 @@ from droid_jax.files import (
     FIT,
     FIT_VERSION,
     FITTED,
+    FULL_GAUSSIAN,
     GAUSSIAN,
     HISTORY,
     HISTORY_TABLE,
@@ -84,7 +85,7 @@ def write_run(
     notes += [f"fitted.xml is not written: {error}"] if error else []
     write_json(folder / FIT, {**fit_json(found, truth or {}, notes), "findings": [asdict(f) for f in findings]})
     found.gaussian.save(folder / GAUSSIAN)
-    found.full_gaussian.save(folder / "gaussian_full.json")
+    found.full_gaussian.save(folder / FULL_GAUSSIAN)
     _write_history(folder, found)
     write_npz(folder / TRACES, traces(found))
     correlation = found.full_gaussian.cov / np.sqrt(

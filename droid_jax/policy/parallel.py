@@ -35,8 +35,9 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
         if randomise is None:
             return wrap(env, episode_length, action_repeat)
         count = len(randomization_fn.keywords["rng"])  # of environments on one device
-        key = jax.random.fold_in(jax.random.PRNGKey(seed), next(uses))
-        doors = Doors(env, randomise, count, devices, key)
+        use = next(uses)
+        there = 1 if use else devices  # it tries on one, so that the best policy is chosen for the same doors anywhere
+        doors = Doors(env, randomise, count, there, jax.random.fold_in(jax.random.PRNGKey(seed), use))
         return AutoResetWrapper(EpisodeWrapper(doors, episode_length, action_repeat))
 
     return wrap_env

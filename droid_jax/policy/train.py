@@ -10,6 +10,7 @@ import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx wit
 # isort: split
 import contextlib
 import functools
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -40,7 +41,7 @@ class TrainConfig:
     """Settings of PPO; the defaults are the preset "quick".
 
     steps: actions in all, over all environments, rounded up to whole rounds.  envs: environments at once, over all
-    devices.  devices: how many; None for the most that divide the environments.
+    devices.  devices: how many; None for the most that divide the environments and the batch.
     hidden: sizes of the hidden layers of actor and critic.
     learning_rate, discount, gae, clip, entropy, reward_scaling: of PPO.
     unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
@@ -104,8 +105,9 @@ class TrainProgress:
     """After each evaluation.
 
     step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
-    of the last part; reward: of an episode; success, blown_up: share of episodes, the latter of those that ended
-    because the simulation was no longer one.
+    of the last part, its evaluation included; reward: of an episode; success, blown_up: share of episodes, the latter
+    of those that ended because the simulation was no longer one.  These count as failures here, and in no rate of
+    `Trials`: no policy shall be the best for the few episodes that it left whole.
     """
 
     step: int
@@ -119,7 +121,7 @@ class TrainProgress:
     @property
     def left(self) -> float:
         """s that the rest will take at this rate; infinite before the first part."""
-        return (self.of - self.step) / self.rate if self.rate > 0 else float("inf")
+        return max(0, self.of - self.step) / self.rate if self.rate > 0 else float("inf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +171,18 @@ def train(
 
 
 def _devices(config: TrainConfig) -> int:
-    """How many devices to use; ValueError where they are not there or do not divide the environments."""
+    """How many devices to use; ValueError where they are not there or do not divide environments and batch.
+
+    brax cuts the unrolls of each device into as many minibatches as of all.
+    """
     there = jax.local_device_count()
     if config.devices is None:
-        return max(d for d in range(1, there + 1) if config.envs % d == 0)
+        return max(d for d in range(1, there + 1) if config.envs % d == config.batch % d == 0)
     if not 1 <= config.devices <= there:
         raise ValueError(f"{config.devices} devices were asked for, there are {there}")
-    if config.envs % config.devices:
-        raise ValueError(f"{config.envs} environments do not divide among {config.devices} devices")
+    for count, what in ((config.envs, "environments"), (config.batch, "unrolls of a minibatch")):
+        if count % config.devices:
+            raise ValueError(f"{count} {what} do not divide among {config.devices} devices")
     return config.devices
 
 
@@ -197,11 +203,12 @@ def _brax(
 
     def tell(step: int, metrics: dict[str, Any]) -> None:
         nonlocal best
+        seconds = time.monotonic() - began
         now = TrainProgress(
             step=done + step,
             of=config.steps,
-            seconds=time.monotonic() - began,
-            rate=float(metrics.get("training/sps", 0.0)),
+            seconds=seconds,
+            rate=(done + step - history[-1].step) / (seconds - history[-1].seconds) if step else 0.0,
             reward=float(metrics["eval/episode_reward"]),
             success=float(metrics["eval/episode_success"]),
             blown_up=float(metrics["eval/episode_blown_up"]),
@@ -306,8 +313,13 @@ def _blank(env: Environment, config: TrainConfig) -> Any:
 
 
 def evaluations_left(config: TrainConfig, steps: int) -> int:
-    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long."""
-    return max(2, 1 + round((config.evaluations - 1) * steps / config.steps))
+    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long.
+
+    Parts are whole rounds, all of as many: so many evaluations that these are hardly more than were asked for.
+    """
+    rounds = math.ceil(steps / (config.batch * config.minibatches * config.unroll))
+    parts = max(1, round((config.evaluations - 1) * steps / config.steps))
+    return 1 + math.ceil(rounds / math.ceil(rounds / parts))
 
 
 def _rank(now: TrainProgress) -> tuple[float, float]:

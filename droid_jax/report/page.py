@@ -32,6 +32,7 @@ from droid_jax.storage import refuse_foreign, write_text
 
 _DOWNLOADS = (
     (files.GAUSSIAN, "the Gaussian of the model's parameters, for training"),
+    (files.FULL_GAUSSIAN, "the same with the nuisances, as train takes it"),
     (files.EXTENDED, "the extended model: effects, values and Gaussian, for fits and training"),
     (files.EXTENDED_MJCF, "the extended model as MJCF, as far as MJCF can express it"),
     (files.FITTED, "the scene with the fitted values"),

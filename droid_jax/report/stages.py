@@ -9,7 +9,7 @@ import hashlib
 from pathlib import Path
 from typing import Any, TypedDict
 
-from droid_jax.files import EXTENDED, GAP, GAUSSIAN, LAST_FILES, SETUP, TO_BE_MADE
+from droid_jax.files import EXTENDED, FULL_GAUSSIAN, GAP, GAUSSIAN, LAST_FILES, SETUP, TO_BE_MADE
 from droid_jax.read_json import read_json, typed
 
 _MEND = "start the run of this folder over with --again"
@@ -31,6 +31,7 @@ class Setup(TypedDict, total=False):
     recording: list[str]
     scene: str | None
     extended: str | None
+    effects: list[str]
     user_effects: str | None
     fit: str | None
     fit_sha256: str | None
@@ -101,11 +102,17 @@ def extended_of(folder: Path) -> Path | None:
     return folder / EXTENDED if (folder / EXTENDED).is_file() else Path(given) if given else None
 
 
+def gaussian_of(folder: Path) -> Path:
+    """Where a folder keeps the Gaussian to train on: with the nuisances, where a fit had any."""
+    full = folder / FULL_GAUSSIAN
+    return full if full.is_file() else folder / GAUSSIAN
+
+
 def fingerprint(folder: Path | None) -> str | None:
     """Hash of what a policy is trained on; None for the prior."""
     if folder is None:
         return None
-    files = [folder / GAUSSIAN, extended_of(folder)]
+    files = [gaussian_of(folder), extended_of(folder)]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files if f is not None and f.is_file())).hexdigest()
 
 

@@ -65,5 +65,5 @@ def fitted(setting: Setting, arguments: Options, code: Mapping[str, Any]) -> Gau
                 scene, door_space(scene), recorded, nuisances=door_nuisances(scene), config=config
             )
             write_json(folder / FIT, {**made_of, "fit": describe(found, truth), "origin": dict(code)})
-            found.gaussian.save(path)
+            found.full_gaussian.save(path)  # what the prior draws, nuisances too
     return load_gaussian(path)

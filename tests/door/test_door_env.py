@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from brax.envs.base import State
 from scripted import action, opening
 
 from droid_jax import runtime
-from droid_jax.door.environment import DoorEnv
+from droid_jax.door.environment import PAST, DoorEnv, World
 from droid_jax.door.hand import finger_forces_c, hand_of, looked
 from droid_jax.door.scene import door_scene
 from droid_jax.door.task import Task
@@ -165,6 +166,16 @@ def test_effects_of_an_extended_model_act_here_too(env: DoorEnv):
     assert pushed[hinge] > plain[hinge] + 1e-4
     late = moved(extended, hinge_preload=0.0, command_delay=TASK.control)
     assert np.all(np.abs(late[arm]) < 0.7 * np.abs(plain[arm])) and np.all(np.abs(plain[arm]) > 1e-3)
+
+
+def test_the_clock_of_a_recording_is_not_the_control_loops(env: DoorEnv):
+    """Late in an episode the servo got a command of three actions before."""
+    extended = DoorEnv(env.scene, TASK, library(env.scene, ("clock_rate",)))
+    number, commands = jax.numpy.float32, jax.numpy.arange(PAST)[:, None] * jax.numpy.ones(9)
+    nothing: Any = None  # that this does not read
+    world = World(*5 * (nothing,), commands, nothing, number(9.0), nothing, nothing)
+    now: Any = SimpleNamespace(time=world.time)
+    np.testing.assert_array_equal(extended._servo({"clock_rate": number(-0.01)}, now, world), commands[-1])
 
 
 def test_a_time_step_that_does_not_fit_is_refused():

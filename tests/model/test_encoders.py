@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
 from droid_jax.cost.cost import make_cost
+from droid_jax.model.encoders import encoder_error
 from droid_jax.model.fields import joint_encoder_offset
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameter_file import load_parameters
@@ -46,6 +49,16 @@ def forces(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # a servo goes by the reading
     mujoco.mj_forward(model, data)
     return np.array([data.qfrc_bias, data.qfrc_passive, data.qfrc_constraint])
+
+
+def test_encoders_are_right_in_a_model_that_a_program_returned():
+    """It has arrays of its own: environments with randomised physics computed errors of zero in every step."""
+    scene = scene_of()
+    model = jax.jit(lambda masses: scene.mjx.replace(body_mass=2 * masses))(scene.mjx.body_mass)
+    assert model.qpos0 is not scene.mjx.qpos0 and encoder_error(scene, model) is None
+    moved = model.replace(qpos0=model.qpos0.at[1].add(-OFF))
+    np.testing.assert_allclose(encoder_error(scene, moved), [0.0, OFF, 0.0], atol=1e-6)
+    np.testing.assert_allclose(jax.jit(partial(encoder_error, scene))(model), 0.0)  # not known while it is traced
 
 
 @pytest.mark.parametrize("reading", [-0.4, 0.8])  # the second beyond its limit of 40 degrees

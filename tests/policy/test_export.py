@@ -161,6 +161,18 @@ def test_what_is_tried_is_not_what_is_trained_on():
     np.testing.assert_array_equal(again, trained)
 
 
+def test_what_is_tried_does_not_depend_on_the_devices():
+    """Other doors were tried on another number of them, and another policy was the best."""
+    keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
+    tried = list[Any]()
+    for devices in (1, 2):
+        wrap_env = wrapped(randomise, devices, 1)
+        for _ in range(2):  # trained in, then tried in
+            env = wrap_env(Spring(), 10, 1, partial(randomise, rng=keys))
+        tried.append(env.reset(keys).obs)
+    np.testing.assert_array_equal(*tried)
+
+
 def test_brax_gets_one_environment_for_each_of_its_keys():
     keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
     env = wrapped(randomise, 2, 1)(Spring(), 10, 1, partial(randomise, rng=keys))

@@ -88,18 +88,23 @@ def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch
     assert _devices(SHORT) == 4
     with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
         _devices(replace(SHORT, devices=5))
+    monkeypatch.setattr(jax, "local_device_count", lambda: 16)
+    with pytest.raises(ValueError, match="8 unrolls of a minibatch do not divide among 16 devices"):
+        _devices(replace(SHORT, devices=16))
 
 
-@pytest.mark.parametrize("devices", [1, 2, 4, 8])
+@pytest.mark.parametrize("devices", [1, 2, 4, 8, 64, 128])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, devices: int):
+    """As many as the batch has unrolls: on 64 cores brax could not divide the batch of "quick"."""
     monkeypatch.setattr(jax, "local_device_count", lambda: devices)
-    assert _devices(PRESETS[preset]) == devices
+    assert _devices(PRESETS[preset]) == min(devices, PRESETS[preset].batch)
 
 
 def test_the_time_left_is_what_the_rest_takes_at_this_rate():
     now = TrainProgress(step=1000, of=4000, seconds=9.0, rate=0.0, reward=0.0, success=0.0)
     assert replace(now, rate=150.0).left == 20.0 and now.left == float("inf")
+    assert replace(now, rate=150.0, step=4096).left == 0.0  # whole rounds may be more than was asked for
 
 
 def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:
@@ -132,6 +137,15 @@ def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: 
     assert [(now.step, now.blown_up) for now in found.history] == [(0, 0.25), (100, 0.25), (200, 0.25), (300, 0.25)]
 
 
+def test_the_rate_counts_the_evaluations_too(monkeypatch: pytest.MonkeyPatch):
+    """The time left was that of the training alone, as brax gives it."""
+    played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.0, 5.0, 1.0), (300, 0.0, 8.0, 2.0))
+    clock = iter([2.0, 12.0, 32.0, 52.0])
+    monkeypatch.setattr("droid_jax.policy.train.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    found = _brax(MADE_UP, None, replace(SHORT, steps=400), None, 0, lambda now: None, lambda step, tree: None)
+    assert [(now.rate, now.left) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
+
+
 @pytest.mark.parametrize("evaluations", [2, 8, 16])
 def test_a_run_that_was_stopped_has_as_many_evaluations_as_one_that_was_not(evaluations: int):
     config = TrainConfig(evaluations=evaluations)
@@ -139,6 +153,22 @@ def test_a_run_that_was_stopped_has_as_many_evaluations_as_one_that_was_not(eval
     for over in range(evaluations - 1):
         assert over + evaluations_left(config, config.steps - over * part) == evaluations
     assert evaluations_left(config, 1) == 2
+
+
+@pytest.mark.parametrize(("asked", "rounds"), [(20_000, 5), (70_000, 18), (4_000_000, 15 * 66)])
+def test_actions_are_rounded_up_to_whole_rounds(asked: int, rounds: int):
+    """A round for each of 15 evaluations were three times 20,000 actions; and a resumed run ended earlier."""
+    config = TrainConfig(steps=asked)
+    one = config.batch * config.minibatches * config.unroll
+    parts = evaluations_left(config, asked) - 1
+    part = -(-asked // (parts * one)) * one  # brax's
+    assert parts * part == rounds * one
+    assert evaluations_left(config, asked - part) - 1 == parts - 1  # where it was stopped after the first
+
+
+@pytest.mark.parametrize("preset", PRESETS.values())
+def test_presets_have_the_evaluations_that_they_say(preset: TrainConfig):
+    assert evaluations_left(preset, preset.steps) == preset.evaluations
 
 
 def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkeypatch: pytest.MonkeyPatch):
