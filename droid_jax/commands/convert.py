@@ -69,8 +69,8 @@ class Convert:
     damping: tuple[float, ...] = ()
     """Servo damping of the commanded joints, N m s/rad (N s/m for slides); default: the scene's."""
     known: tuple[str, ...] = ()
-    """What is known in this recording alone, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or the parameter
-    that stands for it there, e.g. payload=tool."""
+    """What is known in this recording alone, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or the
+    parameter that stands for it there, e.g. payload=tool."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
     --joints."""

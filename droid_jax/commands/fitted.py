@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from droid_jax.commands.folder import PATHS
 from droid_jax.files import CONFIG, EXTENDED, FIT, FULL_GAUSSIAN, GAP
 from droid_jax.read_json import read_json
-from droid_jax.recordings.split import Split
 from droid_jax.report.stages import needs_whole, setup
 
 if TYPE_CHECKING:
@@ -123,6 +122,8 @@ def _extended(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitted
 
 def _fitted_by_search(folder: Path, hashes: Sequence[str]) -> tuple[str, ...]:
     """Those of a search's recordings that its models were fitted to: the third of three motions is test data."""
+    from droid_jax.recordings.split import Split
+
     by = read_json(folder / GAP).get("split", {}).get("by")
     return tuple(hashes[:2] if by == Split.RECORDINGS.value else hashes)
 
