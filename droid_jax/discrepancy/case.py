@@ -210,6 +210,8 @@ class Case:
     once, at the end.  base: the base parameters; effects: those that are tested.
     start: [D] from where the base fit of a log begins, None: the prior's mean.  limits: what cannot be concluded from
     these recordings, beside `Split.limits`.
+    both: the blocks of training and validation together, where they are of the same logs: what tells whether anything
+    is missing at all; None where they are other repeats or motions.
     """
 
     train: ResidualSet
@@ -220,6 +222,7 @@ class Case:
     config: DiscrepancyConfig
     start: np.ndarray | None = None
     limits: tuple[str, ...] = ()
+    both: ResidualSet | None = None
 
     @property
     def full_space(self) -> Space:

@@ -21,7 +21,7 @@ from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.identifiability import moved_by_step, posterior_of, step_shift
-from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig, principal_axes
+from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig, principal_axes
 from droid_jax.identify.multistart import Hypotheses, Look, RefineConfig, Refined, RefineProgress, chords, refine
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
@@ -34,6 +34,7 @@ from droid_jax.simulate.replay import Drive
 FINER = 4  # parts of a time step
 # The step's whole U over U0, of an error that falls no faster than the step: what `beyond_step_error` allows for.
 WORST = (FINER / (FINER - 1)) ** 2
+SLOPES = RefineConfig(iterations=0, basin_hops=0)  # at the model's own values, and no step
 SHORTEST_STEP = 0.25  # share of a step that bounds must leave for a slope
 LONGEST_STEP = 1.0  # search units: what the fit did not constrain at all is no further from it than that
 
@@ -349,6 +350,33 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
         name = residual_set.comparison.name
         raise NotReplayed(f"the simulation of {name!r} blows up at a quarter of its time step")
     return replace(residual_set, step_difference=off)
+
+
+def with_same_step(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> ResidualSet:
+    """`with_step_difference` of other instants of the same logs as those that `fine` was made for."""
+    known = residual_set.cost
+    if isinstance(fine, WindowedLog) and isinstance(known, WindowedLog):
+        fine = replace(fine, whitener=known.whitener, instants=known.instants)
+    return with_step_difference(residual_set, model, fine)
+
+
+def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
+    """A model that was fitted elsewhere, with its residuals and slopes in another residual set; nothing is fitted."""
+    full = residual_set.cost.space
+
+    def residuals(rows: np.ndarray) -> np.ndarray:
+        return residual_set.whitened(full.embed(model.space, rows, model.values))
+
+    problem = DampedProblem(residuals, model.space, SLOPES)
+    state, slopes = problem.start_with_slopes(problem.inside(model.refined.x[None]))
+    if not np.isfinite(state.objective[0]):
+        raise NotReplayed(f"the simulation of {residual_set.comparison.name!r} blows up")
+    refined = replace(
+        model.refined, residual=state.residual[0], jacobian=problem.wide_jacobian(state, slopes[0]),
+        objective=float(state.objective[0]), prior=problem.prior,
+    )  # fmt: skip
+    left = residual_set.resampling.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    return replace(model, refined=refined, residuals=left, discrepancy=residual_set.resampling.discrepancy(left))
 
 
 def discretisation_error(residual_set: ResidualSet, model: FittedModel) -> float:

@@ -31,7 +31,7 @@ from droid_jax.discrepancy.case import (
 )
 from droid_jax.discrepancy.config import FEWER_TRIALS, DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FittedModel, refit
-from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, interleaved
+from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, in_turns, interleaved
 from droid_jax.identify.evaluation import evaluate_on, evaluation_json
 from droid_jax.identify.multistart import RefineProgress
 from droid_jax.identify.search import NotReplayed
@@ -109,7 +109,9 @@ def single_case(
     if own:
         judged = judged.with_nuisances(own)
     base = restrained(base, config.selection.nuisance_bound)
-    return Case(train, validation, judged, base, tuple(effects), config)
+    turns = in_turns([_of_instants(part) for part in (train, validation)])
+    both = with_blocks(log, deviation, turns, config)
+    return Case(train, validation, judged, base, tuple(effects), config, both=both)
 
 
 def base_model(case: Case, start: np.ndarray | None = None, progress: Report = None) -> FittedModel:
@@ -256,6 +258,11 @@ def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: Dis
     return left
 
 
+def _of_instants(residual_set: ResidualSet) -> np.ndarray:
+    """[K] block of each instant of a log."""
+    return residual_set.resampling.block[residual_set.column == 0]  # type: ignore[attr-defined]
+
+
 def with_blocks(
     log: Log, deviation: np.ndarray, block: np.ndarray, config: DiscrepancyConfig, least: int = FEWEST_REPEATS
 ) -> ResidualSet:
@@ -375,6 +382,7 @@ def windowed_case(
         everything = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
         sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
     last = sets[2] if len(sets) > PARTS else None
+    both = with_blocks(log, noise.deviation, in_turns(plan.blocks[:PARTS]), config, 1)
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
     if unknown:
         limits.append(left_out)
@@ -384,7 +392,7 @@ def windowed_case(
             f"{_seconds(train):.0f} s of motion take long to replay: {int(log.unit.max()) + 1} windows of "
             f"{windows.length:g} s, spread over it, stand for them (--replay whole replays all of it).",
         )
-    return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits))
+    return Case(sets[0], sets[1], last, base, tuple(effects), config, noise.values, tuple(limits), both)
 
 
 def _seconds(recordings: Sequence[Recording]) -> float:

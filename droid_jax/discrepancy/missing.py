@@ -29,6 +29,7 @@ from droid_jax.discrepancy.fitting import (
     final_refit,
     final_refit_due,
     with_finer_step,
+    with_same_step,
     with_step_difference,
 )
 from droid_jax.discrepancy.log_case import base_model, case_of
@@ -142,7 +143,8 @@ def search(
         else:
             model = base_fit(case.train, case.base, case.config, report, start)
         report("discretisation_error", None)
-        case = replace(case, train=with_step_difference(case.train, model, fine))
+        both = None if case.both is None else with_same_step(case.both, model, fine)
+        case = replace(case, train=with_step_difference(case.train, model, fine), both=both)
     verdict = search_effects(case, model, discretisation_error(case.train, model), report)
     report("verdict", None)
     return case, verdict

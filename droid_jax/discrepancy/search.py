@@ -27,6 +27,7 @@ from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import CONVERGE_ITERATIONS
 from droid_jax.discrepancy.fitting import (
     FittedModel,
+    at_values,
     fitted_from_prior,
     one_step_fits,
     refit,
@@ -156,7 +157,18 @@ def _explained(problem: Problem, model: FittedModel) -> bool:
     if not asked:
         return True
     problem.progress("score_test", model.name)
-    return _nothing_more(problem, model, score_test(case.train, model, asked, case.config.seed))
+    return _nothing_more(problem, model, _tested(case, model, asked))
+
+
+def _tested(case: Case, model: FittedModel, asked: Sequence[ScoreDirection]) -> ScoreTest:
+    """The score test of the training recording; its p-value is that of all blocks, where validation has the others.
+
+    What is tried next goes by the training blocks alone, so that the validation blocks judge it.
+    """
+    found = score_test(case.train, model, asked, case.config.seed)
+    if case.both is None:
+        return found
+    return replace(found, p=score_test(case.both, at_values(case.both, model), asked, case.config.seed).p)
 
 
 def _nothing_more(problem: Problem, model: FittedModel, found: ScoreTest) -> bool:
@@ -175,7 +187,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     if not asked:
         return replace(state, finished=True, exhausted=True), None
     problem.progress("score_test", model.name)
-    found = score_test(case.train, model, asked, case.config.seed)
+    found = _tested(case, model, asked)
     thresholds = case.config.selection
     exhausted = _nothing_more(problem, model, found)
     info, notes = SelectionStep(found), Notes()
@@ -505,7 +517,7 @@ def without_small_gains(
             continue
         problem.progress("score_test", tried[k].name)
         if asked := open_directions(problem.directions, tried[k]):
-            found = score_test(case.train, tried[k], asked, case.config.seed)
+            found = _tested(case, tried[k], asked)
             if found.p < case.config.selection.significance:
                 break  # what explains less leaves more
         out[k] = replace(tests[k], reasons=tuple(r for r in tests[k].reasons if r.reason is not Reason.SMALL_GAIN))

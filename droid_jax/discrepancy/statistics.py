@@ -20,6 +20,7 @@ contributions); De Santis, Goeman, Hemerik, Davenport, Finos, JASA 2025 (the sca
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -286,6 +287,17 @@ class Repeats:
     ) -> tuple[np.ndarray, float]:
         """Student's t over the repeats; neither the sensitivities nor the base are needed."""
         return largest_detrended_t(scores, seed)
+
+
+def in_turns(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """[M] the blocks [M] of some parts as those of one, which take turns."""
+    out = np.full(len(parts[0]), OUTSIDE)
+    for number, block in enumerate(parts):
+        out = np.where(block == OUTSIDE, out, len(parts) * block + number)
+    kept, within = np.unique(out[out != OUTSIDE], return_inverse=True)
+    assert len(kept)
+    out[out != OUTSIDE] = within
+    return out
 
 
 @dataclass(frozen=True, eq=False)
