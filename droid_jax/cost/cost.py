@@ -176,15 +176,16 @@ def make_cost(
         engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
         config: how simulation and measurement are compared; None for the defaults.
         effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
-            friction behind the sensor where the space holds any, are there already.
+            friction behind the sensor where the space holds any, are there already. Those that raise the dry friction
+            of a joint need `registry.ready(scene)`.
         check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
 
     Returns:
         A cost to be called with [P, D] physical values, which gives [P] N m.
 
     Raises:
-        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or
-            gains that do not match.
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, gains
+            that do not match, or friction effects at joints without a friction row (`registry.ready` makes them).
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -196,8 +197,11 @@ def make_cost(
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
     check_inertia(scene, space)
-    if not any(isinstance(drive, Drive) for drive in drives):
+    commanded = any(isinstance(drive, Drive) for drive in drives)
+    if not commanded:
         _warn_of_commanded(space)
+    elif engine == "mjx":
+        check_friction_rows(scene, space, effects)
     replays = tuple(compiled_replay(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
         _compared(scene, space, recording, drive, replay, config)
@@ -231,6 +235,22 @@ def check_known(space: Space, recordings: Sequence[Recording]) -> None:
             f"parameters {', '.join(idle)} stand for others in recordings that say so, and none does: state it there "
             f"(`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
         )
+
+
+def check_friction_rows(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
+    """Raise ValueError where an effect would raise dry friction of a joint that MJX has no friction row for.
+
+    MJX lays these rows out at compilation: the effect would change nothing.
+    """
+    for effect in (e for e in effects if e.frictionloss is not None):
+        acts = [at for at, names in effect.locations.items() if not {*names}.isdisjoint(space.names)]
+        joints = [at for at in acts if at in scene.single_joints]
+        if without := [j for j in joints if scene.model.dof_frictionloss[scene.dof(j)] <= 0]:
+            raise ValueError(
+                f"effect {effect.name!r} raises dry friction of {', '.join(without)}, which scene {scene.name!r} "
+                "compiled without any, so it would change nothing: use registry.ready(scene) in its place "
+                "(droid_jax.model.effects.registry)"
+            )
 
 
 def _warn_of_commanded(space: Space) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import check_channels
-from droid_jax.cost.cost import Cost, check_read, followed
+from droid_jax.cost.cost import Cost, check_friction_rows, check_read, followed
 from droid_jax.cost.log_piece import STRETCH, TRACES, Piece, as_a_whole, in_windows, replayed, shared_steps
 from droid_jax.cost.noise import Noise
 from droid_jax.cost.observation import Measured, ShortFilter, least_noise
@@ -250,6 +250,7 @@ def windowed_log(
     check_space(scene, space)
     check_channels(recordings, config.channels)
     check_read(scene, space, effects)
+    check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
     reasons = [why_whole(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")

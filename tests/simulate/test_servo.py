@@ -17,6 +17,7 @@ from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.space import torque_offsets
 from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import joint_damping, servo_scale, time_offset
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Scaling, Space
@@ -531,6 +532,19 @@ def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
 
 
 # ----- what is refused
+
+
+def test_friction_effects_without_a_friction_row_are_refused():
+    """0 and 5 N m gave the same cost, without a word: MJX has friction rows only where it compiled friction."""
+    bare = arm()
+    effects = library(bare, ["joint_coulomb"])
+    with pytest.raises(ValueError, match=r"'joint_coulomb' raises dry friction of shoulder, elbow, .*ready\(scene\)"):
+        make_cost(bare, effect_space(effects), recording(), effects=effects)
+    one = effect_space(effects).select(["joint_coulomb[elbow]"])
+    with pytest.raises(ValueError, match="raises dry friction of elbow, which"):
+        make_cost(bare, one, recording(), effects=effects)
+    make_cost(ready(bare), one, recording(), effects=effects)
+    make_cost(bare, SPACE, recording(), effects=effects)  # at neutral, where they do nothing
 
 
 def test_a_recording_without_commands_is_refused(scene: Scene):
