@@ -245,8 +245,13 @@ def windowed_log(
         whole: replay motions whole, as they are where `why_whole` says why.
 
     Raises:
-        ValueError: what `make_cost` refuses, or no window of which enough was measured.
+        ValueError: what `make_cost` refuses, `mj_step`, or no window of which enough was measured.
     """
+    if config.mj_step:
+        raise ValueError(
+            "mj_step is for repeats and for `make_cost`: logs of few repeats are replayed by steps of second order; "
+            "leave mj_step out, and let the program that made the logs take finer steps (0.1 ms)"
+        )
     check_space(scene, space)
     check_channels(recordings, config.channels)
     check_read(scene, space, effects)

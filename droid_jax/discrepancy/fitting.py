@@ -301,9 +301,11 @@ def intervals(
 
 
 def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
-    """The cost of the base model at a quarter of the time step; None without commands, which has no time step."""
+    """The cost of the base model at a quarter of the time step; None where the time step is no error: without commands,
+    which has none, and of data that were made with this very step (`CompareConfig.mj_step`).
+    """
     cost = residual_set.cost
-    if not isinstance(cost.drives[0], Drive):
+    if not isinstance(cost.drives[0], Drive) or residual_set.comparison.config.mj_step:
         return None
     scene = _finer(cost.scene)
     if isinstance(cost, WindowedLog):

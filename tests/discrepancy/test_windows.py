@@ -174,6 +174,13 @@ def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monk
     np.testing.assert_allclose(begun, expected)
 
 
+def test_windows_of_mj_steps_own_steps_are_refused(space: Space):
+    """They were replayed by steps of second order, whatever was asked for."""
+    config = CompareConfig(channels={"position": 1.0}, mj_step=True)
+    with pytest.raises(ValueError, match=r"mj_step is for repeats .* leave mj_step out"):
+        windowed_log(scene(), space, [swung("a", 1.0, 0.7)], config, SHORT)
+
+
 # ----- what windows leave
 
 
