@@ -547,6 +547,18 @@ def test_friction_effects_without_a_friction_row_are_refused():
     make_cost(bare, SPACE, recording(), effects=effects)  # at neutral, where they do nothing
 
 
+def test_a_model_that_was_changed_after_it_was_compiled_is_refused():
+    """MJX kept the old numbers, and all that is read from the model had the new ones: a mixture, without a word."""
+    scene = arm()
+    scene.model.dof_damping[:] = 2.0  # before it is compiled nothing is mixed
+    make_cost(scene, SPACE, recording())
+    other = with_options(scene, timestep=0.004)
+    scene.model.opt.timestep = 0.004
+    with pytest.raises(ValueError, match=r"model of scene 'arm' was changed after it was .*with_options"):
+        make_cost(scene, SPACE, recording())
+    make_cost(other, SPACE, recording())
+
+
 def test_a_recording_without_commands_is_refused(scene: Scene):
     log = recording(time=np.zeros(0), command=np.zeros((0, 0)), command_names=())
     with pytest.raises(ValueError, match=r"'wave' holds no commands.*measured motion"):
