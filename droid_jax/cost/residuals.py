@@ -38,8 +38,8 @@ class CompareConfig:
       weighs several by their noise.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
     non_finite_cost: N m, the cost of a replay that blew up.
-    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut; of a slide
-      only the measured one tells.
+    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut, unless the
+      measured one does so too, or the recording's phases end with the grasp; of a slide only the measured one tells.
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
@@ -263,21 +263,29 @@ def make_comparison(
     )
     acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
     grip = recording.grip_window if acts else None
-    shut = _shut_travel(scene, recording, config) if acts else None
+    shut = _shut_travel(scene, recording, clock, config) if acts else None
     rows = None
-    if grip is not None:
+    if grip is not None and grip[0] < clock[-1]:  # else the grasp has only just ended
         steps, timestep = len(clock), clock[1] - clock[0]
         first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
     return Comparison(recording.name, clock, channels, rows, shut, recording.phases, config)
 
 
-def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> float | None:
-    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little."""
+def _shut_travel(scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig) -> float | None:
+    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little.
+
+    So of a part of a motion in which the measured one does not open either, or that ends with the grasp.
+    """
     if scene.object_joint is None:
         return None
-    least = None if scene.slides(scene.object_joint) else config.shut_angle
-    if "object_angle" not in recording.channels:
-        return least
-    angle = recording.channels["object_angle"]
-    return max(least or 0.0, 0.5 * float(np.ptp(angle.values[angle.mask])))
+    least = 0.0 if scene.slides(scene.object_joint) else config.shut_angle
+    if "object_angle" in recording.channels:
+        angle = recording.channels["object_angle"]
+        inside = (angle.time >= clock[0] - 1e-9) & (angle.time <= clock[-1] + 1e-9)
+        seen = angle.values[:, inside][angle.mask[:, inside]]
+        travel = float(np.ptp(seen)) if seen.size else 0.0
+        return None if travel < least else max(least, 0.5 * travel)
+    grasped = [p.end for p in recording.phases if p.name == "grasp"]
+    follows = any(p.start >= end - 1e-9 for p in recording.phases for end in grasped)
+    return (least or None) if follows or not recording.phases else None

@@ -259,6 +259,24 @@ def test_of_a_drawer_only_the_measured_one_says_what_is_shut(door: Scene):
         assert bool(comparison.failed(door_rollout(object_angle=np.linspace(0, opened, STEPS)))) is shut
 
 
+def test_a_part_of_a_motion_in_which_nothing_opens_does_not_fail(door: Scene):
+    """It asked for five degrees, and for a grip at its last row: the truth failed as everything else did."""
+    still = door_rollout(object_angle=np.zeros(STEPS), contact=contact())
+    assert not door_comparison(door, angle=np.linspace(0, 0.01, STEPS)).failed(still)
+    later = np.where(CLOCK < 1.99, 0.0, 0.8)  # of the replay's own time alone
+    values = np.tile(later[:, None], (2, 1, 1))
+    data = recording(channel("object_angle", CLOCK, values, ["hinge"]), phases=PHASES)
+    torque = channel("torque", CLOCK, np.random.default_rng(0).normal(size=(2, STEPS, 1)), ["panda_joint1"])
+    data = replace(data, channels={**data.channels, "torque": torque})
+    assert make_comparison(door, data, CLOCK, CompareConfig()).failed(still)
+    assert not make_comparison(door, data, CLOCK[:900], CompareConfig()).failed(still)
+    shut = door_rollout(object_angle=np.zeros(STEPS), contact=np.zeros((STEPS, 2), bool))
+    to_the_grasp = (Phase("approach", 0.0, 0.4), Phase("grasp", 0.4, CLOCK[-1]))
+    assert not door_comparison(door, phases=to_the_grasp).failed(shut)
+    assert not door_comparison(door, phases=to_the_grasp[:1]).failed(shut)
+    assert door_comparison(door).failed(still)
+
+
 def test_a_log_without_commands_grips_and_opens_nothing(door: Scene):
     """Nothing was replayed that could have failed."""
     values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
