@@ -37,7 +37,8 @@ class CompareConfig:
     channels: weight of each compared channel in the distance (per unit of the channel); `channels.in_noise_units`
       weighs several by their noise.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
-    non_finite_cost: N m, the cost of a replay that blew up.
+    non_finite_cost: N m, the cost of a replay that blew up.  Weights above one and noise units multiply it, so that it
+      stays above what replays cost (`Comparison.penalty`).
     shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut, unless the
       measured one does so too, or the recording's phases end with the grasp; of a slide only the measured one tells.
     grip_share: share of the gripping time that all fingers must touch.
@@ -104,7 +105,18 @@ class Comparison:
         else:
             total = sum(c.weight * _distance(c, _trace(rollout, c)) for c in self.channels)
         cost = total + self.config.failure_cost * self.failed(rollout)
-        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.config.non_finite_cost)
+        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.penalty)
+
+    @property
+    def penalty(self) -> float:
+        """What a replay that blew up costs, in the distance's unit: `non_finite_cost` in the unit of the channel that
+        weighs most, in which one over the noise is a weight too.
+        """
+        if self.config.whitened:
+            most = max(float(np.abs(c.noise.whitener).max(initial=0.0)) for c in self.channels)
+        else:
+            most = max(c.weight for c in self.channels)
+        return self.config.non_finite_cost * max(1.0, most)
 
     def failed(self, rollout: Rollout) -> jax.Array:
         """[] bool, beta of equation 1: the grasp was lost or the door stayed shut."""

@@ -127,7 +127,7 @@ class WindowedLog(Cost):
             columns = slice(first, first + len(channel.columns))
             total += channel.weight * np.mean(np.linalg.norm(left[..., columns], axis=2), axis=1)
             first += len(channel.columns)
-        return np.where(np.isfinite(total), total, comparison.config.non_finite_cost)[:, None]
+        return np.where(np.isfinite(total), total, comparison.penalty)[:, None]
 
     def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
         """[P, D] -> one array [P, K, C], the leading channel."""

@@ -176,7 +176,7 @@ def fitted_from_prior(
     coefficients = [a for part in parts for a in part.coefficients]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *coefficients])
     found = cma_search(
-        search_cost(lambda rows: np.mean(train.distances(rows), axis=1), config.compare, whole, main, at),
+        search_cost(lambda rows: np.mean(train.distances(rows), axis=1), train.comparison.penalty, whole, main, at),
         main,
         config.search,
         progress=lambda p: progress("search", p),

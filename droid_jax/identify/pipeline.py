@@ -307,7 +307,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     first = problem.early.first()
 
     found = cma_search(
-        search_cost(first, config.compare, full, space),
+        search_cost(first, first.comparisons[0].penalty, full, space),
         space,
         config.search,
         checkpoint_dir=checkpoints,

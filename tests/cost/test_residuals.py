@@ -17,7 +17,9 @@ from droid_jax.cost import observation as measured
 from droid_jax.cost.replay_cache import Batched, cached
 from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
 from droid_jax.door.scene import door_scene
+from droid_jax.identify.fit import search_cost
 from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
 
@@ -301,6 +303,24 @@ def test_a_replay_that_blew_up_has_finite_costs(scene: Scene, whitened: bool):
         cost = float(comparison.distance(tried))
         assert np.isfinite(cost) and cost >= 999.9
         assert np.isnan(np.asarray(comparison.whitened(tried))).all()
+
+
+@pytest.mark.parametrize("config", [{"whitened": True}, {"channels": {"torque": 50.0}}], ids=["whitened", "weighed"])
+def test_a_replay_that_blew_up_costs_more_than_one_that_is_far_off(scene: Scene, config: dict):
+    """In units of the noise it was the cheapest row: 1000, where 100 N m beside the measurement cost more."""
+    values = np.random.default_rng(0).normal(0, 0.02, size=(4, STEPS, 3))
+    comparison = compare(scene, recording(channel("torque", CLOCK, values)), **config)
+    far, blown = rollout(torque=100.0 + 0 * smooth_traces(3, 1)), rollout(finite=np.array(False))
+    assert (
+        1000.0
+        < float(comparison.distance(far))
+        < float(comparison.distance(blown))
+        == pytest.approx(comparison.penalty)
+    )
+    space = Space((Parameter("x", "-", 0.0, 1.0, -1.0, 1.0),))
+    costs = np.array([comparison.distance(far), comparison.distance(blown)])
+    searched = search_cost(lambda rows: costs, comparison.penalty, space, space)(np.zeros((2, 1)))
+    assert np.isfinite(searched).tolist() == [True, False]
 
 
 # ----- whitened residuals
