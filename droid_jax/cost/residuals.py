@@ -34,8 +34,9 @@ LEADS = "torque"  # the channel that others, which follow from it through the se
 class CompareConfig:
     """How simulation and measurement are compared.
 
-    channels: weight of each compared channel in the distance (per unit of the channel); `channels.in_noise_units`
-      weighs several by their noise.
+    channels: weight of each compared channel in the distance, per unit of the channel, above 0;
+      `channels.in_noise_units` weighs several by their noise.  Weights act in the distance and the search alone:
+      residuals in noise units, which are refined, count every channel by its noise.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
     non_finite_cost: N m, the cost of a replay that blew up.  Weights above one and noise units multiply it, so that it
       stays above what replays cost (`Comparison.penalty`).
@@ -79,6 +80,11 @@ class CompareConfig:
             noise=partial(instance, kind=NoiseConfig),
             mj_step=flag,
         )
+        if unweighed := [name for name, weight in self.channels.items() if not weight]:
+            raise ValueError(
+                f"channels: {', '.join(unweighed)} with a weight of 0 would count in noise units nonetheless: leave "
+                "the channel out"
+            )
 
 
 @dataclass(frozen=True, eq=False)

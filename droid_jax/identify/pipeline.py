@@ -62,7 +62,8 @@ class IdentifyConfig:
         compare: how simulation and measurement are compared.
         channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
             those of `compare` where it names other ones, or weights, than its default, else what is informative
-            (`channels.informative_channels`): torque, or without it position and the object's angle.
+            (`channels.informative_channels`): torque, or without it position and the object's angle. Weights act in
+            the distance and the search alone; the refinement counts every channel by its noise.
         identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
         worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
             close and `HeldoutDistance.closed` is None.
