@@ -87,7 +87,10 @@ class Cost:
         return self._blockwise(values, self._smoothed, tuple)
 
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
-        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...]."""
+        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...].
+
+        Its `time` is from 0 where commands were replayed; `comparisons[i].clock` [T] is on recording i's own clock.
+        """
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
 
@@ -120,11 +123,14 @@ class Cost:
         Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion:
         its replay is given it.
         Raises ValueError unless these are as many, with the same commands (where there are none, as many instants on
-        the same clock and the same joints with positions throughout) and the same torque convention.
+        the same clock and the same joints with positions throughout), the same torque convention, `mj_step` and
+        `motion_cutoff`.
         """
         recordings = recordings_of(recordings)
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
+        if config is not None and any(c.config.mj_step != config.mj_step for c in self.comparisons):
+            raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
         made, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
             recording = own_starts(given, (config or old.config).start)
@@ -134,8 +140,8 @@ class Cost:
             if not _same(self.scene, new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
-                    "(side, gravity) or, without commands, has another clock or other joints whose positions were "
-                    "measured throughout"
+                    "(side, gravity) or, without commands, has another clock (motion_cutoff changes it too) or other "
+                    "joints whose positions were measured throughout"
                 )
             drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
             replays.append(along_another(replay, drives[-1]))

@@ -476,6 +476,13 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
     np.testing.assert_allclose(moved.torque, anew.torque, atol=1e-4)
 
 
+def test_a_cost_keeps_its_steps(scene: Scene):
+    """Against another config, mj_step was not what had been asked for, and nobody was told."""
+    cost = make_cost(scene, SPACE, recording(), config=CompareConfig(mj_step=True))
+    with pytest.raises(ValueError, match="compiled with another mj_step"):
+        cost.against([recording()], CompareConfig())
+
+
 @pytest.mark.slow
 def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
     friction = joint_friction_space(JOINTS).select(["coulomb[elbow]"])
