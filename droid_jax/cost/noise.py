@@ -135,7 +135,8 @@ class Noise:
     """Noise of the mean of the repeats, per column, over the coarse clock.
 
     mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit
-    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured.
+    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured, none
+    in a gap of one repeat.
     """
 
     mean: np.ndarray
@@ -144,8 +145,12 @@ class Noise:
     count: np.ndarray
 
     def stated(self, deviation: np.ndarray) -> Noise:
-        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one."""
-        return replace(self, whitener=np.eye(len(self.mean)) / deviation[:, None, None])
+        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one.
+
+        What no repeat measured counts for nothing.
+        """
+        seen = (self.count > 0).T[:, None]  # [C, 1, K]
+        return replace(self, whitener=np.eye(len(self.mean)) * seen / deviation[:, None, None])
 
 
 def estimate_noise(

@@ -522,6 +522,49 @@ def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
         compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
 
 
+@pytest.mark.parametrize("stamps", [True, False], ids=["masked", "without stamps"])
+def test_a_dropout_of_one_repeat_is_left_out(scene: Scene, stamps: bool):
+    """Five lost samples of a 50 Hz log were refused, and `check` called them harmless.
+
+    A trace's size is fitted: with the dropout as without, whatever stands there, and with a restated noise too.
+    """
+    slow = np.arange(0.0, 2.0, 0.02)
+    shape = smooth_traces(3, 1)
+    at = np.stack([np.interp(slow, CLOCK, column) for column in shape.T], axis=1)
+    values = (2.0 * at + np.random.default_rng(0).normal(0, 0.05, at.shape))[None]
+    lost = np.zeros(len(slow), bool)
+    lost[40:45] = True
+
+    def sizes(data: Channel) -> tuple[list[float], list[int]]:
+        found, zeros = [], []
+        made = compare(scene, recording(data))
+        for one in (made, made.stated({"torque": np.full(3, 0.3)})):
+            ends = [np.asarray(one.whitened(rollout(torque=size * shape)), float) for size in (0.0, 1.0)]
+            found.append(float(-ends[0] @ (ends[1] - ends[0]) / np.sum((ends[1] - ends[0]) ** 2)))
+            zeros.append(int(np.sum(ends[0] == 0)))
+        return found, zeros
+
+    whole, none = sizes(channel("torque", slow, values))
+    tries = []
+    for there in (np.nan, 0.0, 1e6):
+        data = np.where(lost[:, None], there, values)
+        mask = np.broadcast_to(~lost[:, None], values.shape)
+        kept = np.ones(len(slow), bool) if stamps else ~lost
+        tries.append(sizes(channel("torque", slow[kept], data[:, kept], mask=mask[:, kept])))
+    assert none == [0, 0] and all(part[1][0] == part[1][1] > 0 for part in tries)
+    assert all(part == tries[0] for part in tries)
+    np.testing.assert_allclose(tries[0][0], whole, atol=5e-3)
+    np.testing.assert_allclose(whole, 2.0, atol=0.02)
+
+
+def test_a_column_that_one_repeat_hardly_measured_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(1, STEPS, 3))
+    mask = np.ones(values.shape, bool)
+    mask[:, 60:, 1] = False
+    with pytest.raises(ValueError, match="'torque', column 'b' was measured for less than 10 % of the time"):
+        compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+
+
 def test_a_channel_outside_the_replay_is_refused(scene: Scene):
     values = np.random.default_rng(0).normal(size=(2, 100, 3))
     with pytest.raises(ValueError, match="torque"):
