@@ -308,9 +308,9 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
     felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
-    return measured_motion(
-        recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt, rest=config.rest
-    )
+    cutoff = config.motion_cutoff
+    joints = prescribed(scene, recording, cutoff)
+    return measured_motion(recording, joints, cutoff=cutoff, alike=felt, rest=config.rest)
 
 
 def _from_one_start(
