@@ -176,10 +176,10 @@ def in_window(
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
-    """The columns of a channel that the scene's measured joints are: others that it has were left out on purpose."""
+    """A channel's columns that are measured joints of the scene, in its order: others were left out on purpose."""
     joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
     unknown = [c for c in channel.columns if c not in joints]
-    kept = [i for i, c in enumerate(channel.columns) if c in scene.joints]
+    kept = [channel.columns.index(joint) for joint in scene.joints if joint in channel.columns]
     if unknown or not kept:
         raise ValueError(
             f"channel {channel.name!r}: unknown joints {', '.join(unknown or channel.columns)}; "

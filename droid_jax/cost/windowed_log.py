@@ -254,6 +254,7 @@ def windowed_log(
         )
     check_space(scene, space)
     check_channels(recordings, config.channels)
+    _check_same_joints(scene, recordings, config)
     check_read(scene, space, effects)
     check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
@@ -281,6 +282,19 @@ def windowed_log(
         np.ones(len(order), bool),
         lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),
     )  # fmt: skip
+
+
+def _check_same_joints(scene: Scene, recordings: Sequence[Recording], config: CompareConfig) -> None:
+    """Raise ValueError where recordings measure a compared channel of different joints; their order does not matter."""
+    for name in config.channels:
+        of = {r.name: [j for j in scene.joints if j in r.channel(name).columns] for r in recordings}
+        shared = [j for j in scene.joints if all(j in joints for joints in of.values())]
+        if any(joints != shared for joints in of.values()):
+            raise ValueError(
+                f"the recordings measure {name} of different joints: "
+                + "; ".join(f"{recording} of {', '.join(joints)}" for recording, joints in of.items())
+                + f"; leave some away, or compare the joints that all of them hold (--joints {' '.join(shared)})"
+            )
 
 
 def _order(pieces: Sequence[Piece], share: float) -> tuple[np.ndarray, np.ndarray, int]:
@@ -316,8 +330,6 @@ def _comparison(
     channels, first = list[Measured](), 0
     for name, weight in config.channels.items():
         columns = pieces[0].columns[name]
-        if any(not np.array_equal(piece.columns[name], columns) for piece in pieces):
-            raise ValueError(f"the recordings measure {name} of different joints, or in another order")
         mean = values[:, first : first + len(columns)]
         first += len(columns)
         noise = Noise(mean, np.zeros((len(columns), 0, 0)), mean[None], np.ones(mean.shape))

@@ -15,6 +15,7 @@ import numpy as np
 import pendulum as made
 import pytest
 from pendulum import TRUE, pendulum, swung
+from two_link import JOINTS, arm, measured, recording
 
 import droid_jax as dj
 from droid_jax.cost.log_piece import shared_steps
@@ -27,6 +28,7 @@ from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.model.effects.registry import library
+from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene, with_options
@@ -179,6 +181,22 @@ def test_windows_of_mj_steps_own_steps_are_refused(space: Space):
     config = CompareConfig(channels={"position": 1.0}, mj_step=True)
     with pytest.raises(ValueError, match=r"mj_step is for repeats .* leave mj_step out"):
         windowed_log(scene(), space, [swung("a", 1.0, 0.7)], config, SHORT)
+
+
+def test_columns_in_another_order_are_the_same_joints():
+    """Logs of one robot were refused where a program wrote its joints in another order."""
+    space = Space((joint_damping(arm(), "elbow", std=0.1, high=50.0),))
+    first = recording(channels={"position": measured(0.0)["position"]}).repeats_subset([0])
+    position, config = first.channels["position"], CompareConfig(channels={"position": 1.0})
+    turned = replace(position, columns=JOINTS[::-1], values=position.values[..., ::-1], mask=position.mask[..., ::-1])
+    second = replace(first, name="turned", channels={"position": turned})
+    log = windowed_log(arm(), space, [first, second], config, SHORT)
+    assert [piece.columns["position"].tolist() for piece in log.pieces] == [[0, 1], [0, 1]]
+    np.testing.assert_allclose(log.pieces[0].measured, log.pieces[1].measured)
+    alone = replace(position, columns=JOINTS[:1], values=position.values[..., :1], mask=position.mask[..., :1])
+    one = replace(first, name="one", channels={"position": alone})
+    with pytest.raises(ValueError, match=r"different joints: wave of shoulder, elbow; one of shoulder; .*--joints sho"):
+        windowed_log(arm(), space, [first, one], config, SHORT, whole=True)
 
 
 # ----- what windows leave
