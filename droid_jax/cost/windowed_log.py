@@ -6,6 +6,7 @@ begins is measured, and how well enters the noise: what the spread of its state 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -25,7 +26,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Phase, Recording
 from droid_jax.simulate.replay import Drive
-from droid_jax.simulate.windows import WindowConfig, why_whole
+from droid_jax.simulate.windows import TooShort, WindowConfig, why_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,7 @@ class WindowedLog(Cost):
     instants: [K] bool, those that count.  again: makes the same of another scene and space, with windows on a grid [s]
     of time steps.  whitener: [windows, K C, K C] of each piece, None: not stated yet.
     spreads: what the states' spread does, of each piece; see `about`.
+    too_short: recordings that no window fits into.
     """
 
     pieces: tuple[Piece, ...]
@@ -81,6 +83,7 @@ class WindowedLog(Cost):
     again: Callable[[Scene, Space, float], WindowedLog]
     whitener: tuple[Whitener, ...] | None = None
     spreads: tuple[np.ndarray | None, ...] = field(default=())
+    too_short: tuple[str, ...] = ()
 
     def simulated(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, K, C] compared channels through the filter of their data, in their units; NaN throughout where
@@ -245,7 +248,8 @@ def windowed_log(
         whole: replay motions whole, as they are where `why_whole` says why.
 
     Raises:
-        ValueError: what `make_cost` refuses, `mj_step`, or no window of which enough was measured.
+        ValueError: what `make_cost` refuses, `mj_step`, recordings that are all shorter than a window, or no window of
+            which enough was measured.
     """
     if config.mj_step:
         raise ValueError(
@@ -266,21 +270,28 @@ def windowed_log(
         assert isinstance(drive, Drive)
         drives.append(drive)
     lasting = shared_steps([len(drive.command) for drive in drives])
-    made = list[Piece | None]()
+    made, short = list[Piece | None](), dict[str, TooShort]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):
             of = scene, space, recording, repeat, drive, config, windows, effects
-            made.append(as_a_whole(*of, steps, grid) if why else in_windows(*of, grid))
+            number = sum(piece.count for piece in made if piece is not None)
+            try:
+                made.append(as_a_whole(*of, steps, grid) if why else in_windows(*of, grid, number))
+            except TooShort as error:
+                short[recording.name] = error
     pieces = [piece for piece in made if piece is not None and piece.at.size]
+    if not pieces and short:
+        raise next(iter(short.values()))
     if not pieces:
         raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")
     order, unit, fitted = _order(pieces, fitted_share)
-    comparison = _comparison(scene, recordings, pieces, order, config)
+    comparison = _comparison(scene, [r for r in recordings if r.name not in short], pieces, order, config)
     return WindowedLog(
         scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
         tuple(pieces), order, unit, fitted, why, STRETCH if why else windows.length,
         np.ones(len(order), bool),
         lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),
+        too_short=tuple(short),
     )  # fmt: skip
 
 
@@ -300,14 +311,17 @@ def _check_same_joints(scene: Scene, recordings: Sequence[Recording], config: Co
 def _order(pieces: Sequence[Piece], share: float) -> tuple[np.ndarray, np.ndarray, int]:
     """The pieces' instants [K] in the log's order, the unit [K] of each, and how many units come first.
 
-    The first part of every piece, then the rest of every piece.
+    The first part of every piece, then the rest of every piece; of pieces of one unit, the share of them.
     """
     groups: tuple[list[np.ndarray], list[np.ndarray]] = [], []
-    first = 0
+    first = single = 0
     for piece in pieces:
         unit = np.unique(piece.unit.ravel(), return_inverse=True)[1].ravel()
         count = int(unit.max()) + 1
         fitted = min(count, max(1, round(share * count)))
+        if count == 1:  # in turns
+            fitted = math.ceil(share * (single + 1) - 1e-9) - math.ceil(share * single - 1e-9)
+            single += 1
         numbers = np.arange(len(unit)) + first
         for group, inside in zip(groups, (range(fitted), range(fitted, count)), strict=True):
             group += [numbers[unit == u] for u in inside]

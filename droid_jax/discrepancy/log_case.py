@@ -378,6 +378,8 @@ def windowed_case(
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
     if unknown:
         limits.append(left_out)
+    if short := [*log.too_short, *(() if judged is None else judged.too_short)]:
+        limits.append(f"Shorter than a window and left out: {', '.join(short)} (--replay whole takes them).")
     if sampled and not log.whole:
         limits.insert(
             0,

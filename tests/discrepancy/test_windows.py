@@ -108,7 +108,7 @@ def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases()
     assert len(places) == 20 and places.min() >= 0 and places.max() <= last
     np.testing.assert_array_equal(places // 600, np.arange(20))
     assert np.diff(places).min() >= least and len(np.unique(places % 600)) == 20
-    np.testing.assert_array_equal(_spread(90, 40, 200.0), [30])
+    np.testing.assert_array_equal(_spread(90, 40, 200.0), [55])
     crowded = _spread(2300, 1500, 1500.0)  # 2300 / 1500 rounds up
     assert len(crowded) == 1 or np.diff(crowded).min() >= 1500
 
@@ -123,6 +123,20 @@ def test_windows_that_are_left_out_are_not_compared(space: Space):
     assert np.sqrt(np.mean(log.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
     finer = log.finer(with_options(scene(), timestep=0.002), space)
     np.testing.assert_allclose(finer.pieces[0].windows.begin, log.pieces[0].windows.begin)
+
+
+def test_short_logs_have_windows_at_different_places_and_some_are_test_data(space: Space):
+    """Each gave one window, at its very beginning, and all of them trained; one that is too short ended all."""
+    config, windows = CompareConfig(channels={"position": 1.0}), replace(SHORT, length=1.0, every=1.0)
+    logs = [replace(swung("a", 1.0, 0.7), name=name) for name in "abc"]
+    stub = replace(logs[0].window(0.0, 1.0), name="stub")
+    log = windowed_log(scene(), space, [logs[0], stub, *logs[1:]], config, windows, fitted_share=2 / 3)
+    begin = np.concatenate([piece.windows.begin for piece in log.pieces])
+    assert len(begin) == 3 and np.diff(np.sort(begin)).min() > 0.1 and begin.max() > 0.6
+    assert (log.fitted, log.unit.max() + 1) == (2, 3) and log.too_short == ("stub",)
+    assert log.comparisons[0].name == "a and b and c"
+    with pytest.raises(ValueError, match="'stub' of 1 s is shorter than one window"):
+        windowed_log(scene(), space, [stub], config, windows)
 
 
 class Caught(Exception):
