@@ -37,7 +37,7 @@ class NoiseConfig:
       no noise; of fewer a straight line takes too much.
     moving_share: share of the low pass's window at least in which a joint moves, where what a fit leaves tells of
       noise: at rest along a prescribed motion friction takes what is left.
-    least_overlap: share of a recording's time that two repeats at least must have measured.
+    least_overlap: share of a recording's time that two repeats at least, or the only one, must have measured.
     minimum: channel -> deviation below which its noise is never believed, in the channel's unit: what sensors of arms
       resolve.
     minimum_share: likewise of a channel that one repeat measured, as a share of what moves in it where its motor is
