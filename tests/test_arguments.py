@@ -49,6 +49,7 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CompareConfig(channels={"torque": -1.0}), "channels, 'torque' must be at least 0, got -1.0"),
         (lambda: CompareConfig(channels={"torque": "1"}), "channels, 'torque' must be a number"),  # pyright: ignore
         (lambda: CompareConfig(channels={"torque": 0.0}), "channels must have a weight above 0"),
+        (lambda: CompareConfig(channels={"torque": 1.0, "position": 0.0}), "channels: position with a weight of 0"),
         (lambda: CompareConfig(channels=["torque"]), "channels must map names to weights"),  # pyright: ignore
         (lambda: CompareConfig(whitened="yes"), "whitened must be True or False, got 'yes'"),  # pyright: ignore
         (lambda: CompareConfig(grip_share=1.5), "grip_share must be at most 1, got 1.5"),

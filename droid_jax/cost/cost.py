@@ -87,7 +87,10 @@ class Cost:
         return self._blockwise(values, self._smoothed, tuple)
 
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
-        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...]."""
+        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...].
+
+        Its `time` is from 0 where commands were replayed; `comparisons[i].clock` [T] is on recording i's own clock.
+        """
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
 
@@ -120,11 +123,14 @@ class Cost:
         Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion:
         its replay is given it.
         Raises ValueError unless these are as many, with the same commands (where there are none, as many instants on
-        the same clock and the same joints with positions throughout) and the same torque convention.
+        the same clock and the same joints with positions throughout), the same torque convention, `mj_step` and
+        `motion_cutoff`.
         """
         recordings = recordings_of(recordings)
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
+        if config is not None and any(c.config.mj_step != config.mj_step for c in self.comparisons):
+            raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
         made, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
             recording = own_starts(given, (config or old.config).start)
@@ -134,8 +140,8 @@ class Cost:
             if not _same(self.scene, new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
-                    "(side, gravity) or, without commands, has another clock or other joints whose positions were "
-                    "measured throughout"
+                    "(side, gravity) or, without commands, has another clock (motion_cutoff changes it too) or other "
+                    "joints whose positions were measured throughout"
                 )
             drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
             replays.append(along_another(replay, drives[-1]))
@@ -176,15 +182,16 @@ def make_cost(
         engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
         config: how simulation and measurement are compared; None for the defaults.
         effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
-            friction behind the sensor where the space holds any, are there already.
+            friction behind the sensor where the space holds any, are there already. Those that raise the dry friction
+            of a joint need `registry.ready(scene)`.
         check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
 
     Returns:
         A cost to be called with [P, D] physical values, which gives [P] N m.
 
     Raises:
-        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, or
-            gains that do not match.
+        ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, gains
+            that do not match, or friction effects at joints without a friction row (`registry.ready` makes them).
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -196,8 +203,11 @@ def make_cost(
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
     check_inertia(scene, space)
-    if not any(isinstance(drive, Drive) for drive in drives):
+    commanded = any(isinstance(drive, Drive) for drive in drives)
+    if not commanded:
         _warn_of_commanded(space)
+    elif engine == "mjx":
+        check_friction_rows(scene, space, effects)
     replays = tuple(compiled_replay(engine, scene, space, d, effects, config.mj_step) for d in drives)
     comparisons = tuple(
         _compared(scene, space, recording, drive, replay, config)
@@ -231,6 +241,22 @@ def check_known(space: Space, recordings: Sequence[Recording]) -> None:
             f"parameters {', '.join(idle)} stand for others in recordings that say so, and none does: state it there "
             f"(`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
         )
+
+
+def check_friction_rows(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
+    """Raise ValueError where an effect would raise dry friction of a joint that MJX has no friction row for.
+
+    MJX lays these rows out at compilation: the effect would change nothing.
+    """
+    for effect in (e for e in effects if e.frictionloss is not None):
+        acts = [at for at, names in effect.locations.items() if not {*names}.isdisjoint(space.names)]
+        joints = [at for at in acts if at in scene.single_joints]
+        if without := [j for j in joints if scene.model.dof_frictionloss[scene.dof(j)] <= 0]:
+            raise ValueError(
+                f"effect {effect.name!r} raises dry friction of {', '.join(without)}, which scene {scene.name!r} "
+                "compiled without any, so it would change nothing: use registry.ready(scene) in its place "
+                "(droid_jax.model.effects.registry)"
+            )
 
 
 def _warn_of_commanded(space: Space) -> None:
@@ -282,9 +308,9 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
     felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
-    return measured_motion(
-        recording, prescribed(scene, recording), cutoff=config.motion_cutoff, alike=felt, rest=config.rest
-    )
+    cutoff = config.motion_cutoff
+    joints = prescribed(scene, recording, cutoff)
+    return measured_motion(recording, joints, cutoff=cutoff, alike=felt, rest=config.rest)
 
 
 def _from_one_start(

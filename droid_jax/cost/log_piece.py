@@ -203,9 +203,10 @@ def in_windows(
     windows: WindowConfig,
     effects: Sequence[Effect],
     grid: float | None,
+    number: int = 0,
 ) -> Piece | None:
     """A repeat in windows, without those in which something was not measured; see `windowed_log`.  None: in all."""
-    made = cut(scene, recording, drive, repeat, windows, grid)
+    made = cut(scene, recording, drive, repeat, windows, grid, number)
     if not len(made.begin):
         return None
     instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate

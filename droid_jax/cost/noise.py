@@ -37,7 +37,7 @@ class NoiseConfig:
       no noise; of fewer a straight line takes too much.
     moving_share: share of the low pass's window at least in which a joint moves, where what a fit leaves tells of
       noise: at rest along a prescribed motion friction takes what is left.
-    least_overlap: share of a recording's time that two repeats at least must have measured.
+    least_overlap: share of a recording's time that two repeats at least, or the only one, must have measured.
     minimum: channel -> deviation below which its noise is never believed, in the channel's unit: what sensors of arms
       resolve.
     minimum_share: likewise of a channel that one repeat measured, as a share of what moves in it where its motor is
@@ -135,7 +135,8 @@ class Noise:
     """Noise of the mean of the repeats, per column, over the coarse clock.
 
     mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit
-    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured.
+    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured, none
+    in a gap of one repeat.
     """
 
     mean: np.ndarray
@@ -144,8 +145,12 @@ class Noise:
     count: np.ndarray
 
     def stated(self, deviation: np.ndarray) -> Noise:
-        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one."""
-        return replace(self, whitener=np.eye(len(self.mean)) / deviation[:, None, None])
+        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one.
+
+        What no repeat measured counts for nothing.
+        """
+        seen = (self.count > 0).T[:, None]  # [C, 1, K]
+        return replace(self, whitener=np.eye(len(self.mean)) * seen / deviation[:, None, None])
 
 
 def estimate_noise(

@@ -61,8 +61,8 @@ class Measured:
 
     unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
     of the simulated channel; kernel from the trace to K instants, and noise for the whitened form; span [2] s of the
-    coarse clock; weight in the distance; moves [K,C] bool, instants at which a column's joint moves: at rest along a
-    prescribed motion friction takes what is left, and what is left tells nothing of noise.
+    coarse clock; weight in the distance; moves [K,C] bool, instants that were measured and at which a column's joint
+    moves: at rest along a prescribed motion friction takes what is left, and what is left tells nothing of noise.
     """
 
     name: str
@@ -104,7 +104,7 @@ def prepared(
     """A channel made ready for a replay whose rows have the times `clock` [T] s; apart, rest: as in `make_comparison`.
 
     Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
-    one with a stretch that nothing measured, and one too long for the memory.
+    one with a stretch that none of several repeats measured, and one too long for the memory.
     """
     channel, columns = compared_columns(scene, channel, config)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
@@ -136,7 +136,7 @@ def prepared(
         noise=noise,
         span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
-        moves=kernel @ (resampling @ (~still[:, columns]).astype(float)) > config.moving_share,
+        moves=(kernel @ (resampling @ (~still[:, columns]).astype(float)) > config.moving_share) & (noise.count > 0),
     )
 
 
@@ -176,10 +176,10 @@ def in_window(
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
-    """The columns of a channel that the scene's measured joints are: others that it has were left out on purpose."""
+    """A channel's columns that are measured joints of the scene, in its order: others were left out on purpose."""
     joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
     unknown = [c for c in channel.columns if c not in joints]
-    kept = [i for i, c in enumerate(channel.columns) if c in scene.joints]
+    kept = [channel.columns.index(joint) for joint in scene.joints if joint in channel.columns]
     if unknown or not kept:
         raise ValueError(
             f"channel {channel.name!r}: unknown joints {', '.join(unknown or channel.columns)}; "
@@ -258,11 +258,20 @@ def _refuse_constant(channel: Channel) -> None:
 def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray, overlap: float) -> tuple[np.ndarray, np.ndarray]:
     """Repeats [N, K, C] whose gaps take the other repeats' mean there, and what was measured.
 
-    Raises ValueError for a gap in all repeats, and for a column that hardly two of several measured: nothing says then
-    how noisy it is.
+    The gaps of one repeat alone are zero, as its filter of the simulation is there, and count for nothing.
+    Raises ValueError for a gap in all of several repeats, and for a column that hardly two of several measured, since
+    nothing says then how noisy it is, or one alone hardly did.
     """
     measured = ~np.isnan(repeats)
     count = measured.sum(axis=0)
+    seldom = np.flatnonzero(count.sum(axis=0) < overlap * len(clock))
+    if len(repeats) == 1 and len(seldom):
+        raise ValueError(
+            f"channel {channel.name!r}, column {channel.columns[seldom[0]]!r} was measured for less than "
+            f"{100 * overlap:g} % of the time: leave the column away"
+        )
+    if len(repeats) == 1:
+        return np.where(measured, repeats, 0.0), measured
     gaps = np.argwhere(count == 0)
     if len(gaps):
         instant, column = gaps[0]
@@ -271,7 +280,7 @@ def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray, overlap: flo
             f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column away"
         )
     alone = np.flatnonzero((count - 1).sum(axis=0) < overlap * len(clock))
-    if len(repeats) > 1 and len(alone):
+    if len(alone):
         raise ValueError(
             f"channel {channel.name!r}, column {channel.columns[alone[0]]!r} was measured by one repeat only for most "
             "of the time, so its noise is not known: leave the column away, or the other repeats"

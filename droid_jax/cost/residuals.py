@@ -34,12 +34,14 @@ LEADS = "torque"  # the channel that others, which follow from it through the se
 class CompareConfig:
     """How simulation and measurement are compared.
 
-    channels: weight of each compared channel in the distance (per unit of the channel); `channels.in_noise_units`
-      weighs several by their noise.
+    channels: weight of each compared channel in the distance, per unit of the channel, above 0;
+      `channels.in_noise_units` weighs several by their noise.  Weights act in the distance and the search alone:
+      residuals in noise units, which are refined, count every channel by its noise.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
-    non_finite_cost: N m, the cost of a replay that blew up.
-    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut; of a slide
-      only the measured one tells.
+    non_finite_cost: N m, the cost of a replay that blew up.  Weights above one and noise units multiply it, so that it
+      stays above what replays cost (`Comparison.penalty`).
+    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut, unless the
+      measured one does so too, or the recording's phases end with the grasp; of a slide only the measured one tells.
     grip_share: share of the gripping time that all fingers must touch.
     whitened: the cost is the root mean square of the whitened residuals instead of N m.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
@@ -78,6 +80,11 @@ class CompareConfig:
             noise=partial(instance, kind=NoiseConfig),
             mj_step=flag,
         )
+        if unweighed := [name for name, weight in self.channels.items() if not weight]:
+            raise ValueError(
+                f"channels: {', '.join(unweighed)} with a weight of 0 would count in noise units nonetheless: leave "
+                "the channel out"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +111,18 @@ class Comparison:
         else:
             total = sum(c.weight * _distance(c, _trace(rollout, c)) for c in self.channels)
         cost = total + self.config.failure_cost * self.failed(rollout)
-        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.config.non_finite_cost)
+        return jnp.where(rollout.finite & jnp.isfinite(cost), cost, self.penalty)
+
+    @property
+    def penalty(self) -> float:
+        """What a replay that blew up costs, in the distance's unit: `non_finite_cost` in the unit of the channel that
+        weighs most, in which one over the noise is a weight too.
+        """
+        if self.config.whitened:
+            most = max(float(np.abs(c.noise.whitener).max(initial=0.0)) for c in self.channels)
+        else:
+            most = max(c.weight for c in self.channels)
+        return self.config.non_finite_cost * max(1.0, most)
 
     def failed(self, rollout: Rollout) -> jax.Array:
         """[] bool, beta of equation 1: the grasp was lost or the door stayed shut."""
@@ -263,21 +281,29 @@ def make_comparison(
     )
     acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
     grip = recording.grip_window if acts else None
-    shut = _shut_travel(scene, recording, config) if acts else None
+    shut = _shut_travel(scene, recording, clock, config) if acts else None
     rows = None
-    if grip is not None:
+    if grip is not None and grip[0] < clock[-1]:  # else the grasp has only just ended
         steps, timestep = len(clock), clock[1] - clock[0]
         first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
     return Comparison(recording.name, clock, channels, rows, shut, recording.phases, config)
 
 
-def _shut_travel(scene: Scene, recording: Recording, config: CompareConfig) -> float | None:
-    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little."""
+def _shut_travel(scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig) -> float | None:
+    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little.
+
+    So of a part of a motion in which the measured one does not open either, or that ends with the grasp.
+    """
     if scene.object_joint is None:
         return None
-    least = None if scene.slides(scene.object_joint) else config.shut_angle
-    if "object_angle" not in recording.channels:
-        return least
-    angle = recording.channels["object_angle"]
-    return max(least or 0.0, 0.5 * float(np.ptp(angle.values[angle.mask])))
+    least = 0.0 if scene.slides(scene.object_joint) else config.shut_angle
+    if "object_angle" in recording.channels:
+        angle = recording.channels["object_angle"]
+        inside = (angle.time >= clock[0] - 1e-9) & (angle.time <= clock[-1] + 1e-9)
+        seen = angle.values[:, inside][angle.mask[:, inside]]
+        travel = float(np.ptp(seen)) if seen.size else 0.0
+        return None if travel < least else max(least, 0.5 * travel)
+    grasped = [p.end for p in recording.phases if p.name == "grasp"]
+    follows = any(p.start >= end - 1e-9 for p in recording.phases for end in grasped)
+    return (least or None) if follows or not recording.phases else None

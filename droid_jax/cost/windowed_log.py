@@ -6,6 +6,7 @@ begins is measured, and how well enters the noise: what the spread of its state 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import check_channels
-from droid_jax.cost.cost import Cost, check_read, followed
+from droid_jax.cost.cost import Cost, check_friction_rows, check_read, followed
 from droid_jax.cost.log_piece import STRETCH, TRACES, Piece, as_a_whole, in_windows, replayed, shared_steps
 from droid_jax.cost.noise import Noise
 from droid_jax.cost.observation import Measured, ShortFilter, least_noise
@@ -25,7 +26,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Phase, Recording
 from droid_jax.simulate.replay import Drive
-from droid_jax.simulate.windows import WindowConfig, why_whole
+from droid_jax.simulate.windows import TooShort, WindowConfig, why_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,7 @@ class WindowedLog(Cost):
     instants: [K] bool, those that count.  again: makes the same of another scene and space, with windows on a grid [s]
     of time steps.  whitener: [windows, K C, K C] of each piece, None: not stated yet.
     spreads: what the states' spread does, of each piece; see `about`.
+    too_short: recordings that no window fits into.
     """
 
     pieces: tuple[Piece, ...]
@@ -81,6 +83,7 @@ class WindowedLog(Cost):
     again: Callable[[Scene, Space, float], WindowedLog]
     whitener: tuple[Whitener, ...] | None = None
     spreads: tuple[np.ndarray | None, ...] = field(default=())
+    too_short: tuple[str, ...] = ()
 
     def simulated(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, K, C] compared channels through the filter of their data, in their units; NaN throughout where
@@ -127,7 +130,7 @@ class WindowedLog(Cost):
             columns = slice(first, first + len(channel.columns))
             total += channel.weight * np.mean(np.linalg.norm(left[..., columns], axis=2), axis=1)
             first += len(channel.columns)
-        return np.where(np.isfinite(total), total, comparison.config.non_finite_cost)[:, None]
+        return np.where(np.isfinite(total), total, comparison.penalty)[:, None]
 
     def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
         """[P, D] -> one array [P, K, C], the leading channel."""
@@ -245,11 +248,19 @@ def windowed_log(
         whole: replay motions whole, as they are where `why_whole` says why.
 
     Raises:
-        ValueError: what `make_cost` refuses, or no window of which enough was measured.
+        ValueError: what `make_cost` refuses, `mj_step`, recordings that are all shorter than a window, or no window of
+            which enough was measured.
     """
+    if config.mj_step:
+        raise ValueError(
+            "mj_step is for repeats and for `make_cost`: logs of few repeats are replayed by steps of second order; "
+            "leave mj_step out, and let the program that made the logs take finer steps (0.1 ms)"
+        )
     check_space(scene, space)
     check_channels(recordings, config.channels)
+    _check_same_joints(scene, recordings, config)
     check_read(scene, space, effects)
+    check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
     reasons = [why_whole(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")
@@ -259,35 +270,58 @@ def windowed_log(
         assert isinstance(drive, Drive)
         drives.append(drive)
     lasting = shared_steps([len(drive.command) for drive in drives])
-    made = list[Piece | None]()
+    made, short = list[Piece | None](), dict[str, TooShort]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):
             of = scene, space, recording, repeat, drive, config, windows, effects
-            made.append(as_a_whole(*of, steps, grid) if why else in_windows(*of, grid))
+            number = sum(piece.count for piece in made if piece is not None)
+            try:
+                made.append(as_a_whole(*of, steps, grid) if why else in_windows(*of, grid, number))
+            except TooShort as error:
+                short[recording.name] = error
     pieces = [piece for piece in made if piece is not None and piece.at.size]
+    if not pieces and short:
+        raise next(iter(short.values()))
     if not pieces:
         raise ValueError(f"recordings {', '.join(r.name for r in recordings)}: no window was measured throughout")
     order, unit, fitted = _order(pieces, fitted_share)
-    comparison = _comparison(scene, recordings, pieces, order, config)
+    comparison = _comparison(scene, [r for r in recordings if r.name not in short], pieces, order, config)
     return WindowedLog(
         scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
         tuple(pieces), order, unit, fitted, why, STRETCH if why else windows.length,
         np.ones(len(order), bool),
         lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),
+        too_short=tuple(short),
     )  # fmt: skip
+
+
+def _check_same_joints(scene: Scene, recordings: Sequence[Recording], config: CompareConfig) -> None:
+    """Raise ValueError where recordings measure a compared channel of different joints; their order does not matter."""
+    for name in config.channels:
+        of = {r.name: [j for j in scene.joints if j in r.channel(name).columns] for r in recordings}
+        shared = [j for j in scene.joints if all(j in joints for joints in of.values())]
+        if any(joints != shared for joints in of.values()):
+            raise ValueError(
+                f"the recordings measure {name} of different joints: "
+                + "; ".join(f"{recording} of {', '.join(joints)}" for recording, joints in of.items())
+                + f"; leave some away, or compare the joints that all of them hold (--joints {' '.join(shared)})"
+            )
 
 
 def _order(pieces: Sequence[Piece], share: float) -> tuple[np.ndarray, np.ndarray, int]:
     """The pieces' instants [K] in the log's order, the unit [K] of each, and how many units come first.
 
-    The first part of every piece, then the rest of every piece.
+    The first part of every piece, then the rest of every piece; of pieces of one unit, the share of them.
     """
     groups: tuple[list[np.ndarray], list[np.ndarray]] = [], []
-    first = 0
+    first = single = 0
     for piece in pieces:
         unit = np.unique(piece.unit.ravel(), return_inverse=True)[1].ravel()
         count = int(unit.max()) + 1
         fitted = min(count, max(1, round(share * count)))
+        if count == 1:  # in turns
+            fitted = math.ceil(share * (single + 1) - 1e-9) - math.ceil(share * single - 1e-9)
+            single += 1
         numbers = np.arange(len(unit)) + first
         for group, inside in zip(groups, (range(fitted), range(fitted, count)), strict=True):
             group += [numbers[unit == u] for u in inside]
@@ -310,8 +344,6 @@ def _comparison(
     channels, first = list[Measured](), 0
     for name, weight in config.channels.items():
         columns = pieces[0].columns[name]
-        if any(not np.array_equal(piece.columns[name], columns) for piece in pieces):
-            raise ValueError(f"the recordings measure {name} of different joints, or in another order")
         mean = values[:, first : first + len(columns)]
         first += len(columns)
         noise = Noise(mean, np.zeros((len(columns), 0, 0)), mean[None], np.ones(mean.shape))

@@ -177,7 +177,7 @@ def fitted_from_prior(
     coefficients = [a for part in parts for a in part.coefficients]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *coefficients])
     found = cma_search(
-        search_cost(lambda rows: np.mean(train.distances(rows), axis=1), config.compare, whole, main, at),
+        search_cost(lambda rows: np.mean(train.distances(rows), axis=1), train.comparison.penalty, whole, main, at),
         main,
         config.search,
         progress=lambda p: progress("search", p),
@@ -302,9 +302,11 @@ def intervals(
 
 
 def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
-    """The cost of the base model at a quarter of the time step; None without commands, which has no time step."""
+    """The cost of the base model at a quarter of the time step; None where the time step is no error: without commands,
+    which has none, and of data that were made with this very step (`CompareConfig.mj_step`).
+    """
     cost = residual_set.cost
-    if not isinstance(cost.drives[0], Drive):
+    if not isinstance(cost.drives[0], Drive) or residual_set.comparison.config.mj_step:
         return None
     scene = _finer(cost.scene)
     if isinstance(cost, WindowedLog):

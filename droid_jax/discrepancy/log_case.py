@@ -318,7 +318,8 @@ def windowed_case(
 ) -> Case:
     """A case of pooled logs: their windows train and validate in turns, block by block.
 
-    The last third of every log is test data, or other recordings are, which have torque offsets of their own.
+    The last third of every log is test data (of logs of one window each every third log), or other recordings are,
+    which have torque offsets of their own.
 
     Args:
         scene: the robot.
@@ -332,7 +333,8 @@ def windowed_case(
         progress: called with each iteration of the first fits, which tell the noise.
 
     Raises:
-        ValueError: recordings of different channels or joints, or so short that no two blocks are in each part.
+        ValueError: recordings of different channels or joints, or so short that no two blocks are in each part. One
+            that is shorter than a window is left out (`Case.limits`).
     """
     config = config or DiscrepancyConfig()
     config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
@@ -386,6 +388,8 @@ def windowed_case(
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
     if unknown:
         limits.append(left_out)
+    if short := [*log.too_short, *(() if judged is None else judged.too_short)]:
+        limits.append(f"Shorter than a window and left out: {', '.join(short)} (--replay whole takes them).")
     if sampled and not log.whole:
         limits.insert(
             0,

@@ -135,13 +135,11 @@ def search(
         progress: called with a stage's name and its progress value.
     """
     report = progress or (lambda stage, value: None)
-    if split is Split.BLOCKS:
+    if split in (Split.BLOCKS, Split.WINDOWS):
         model = base_model(case, progress=lambda now: report("refine", now))
     else:
-        if split is Split.WINDOWS:
-            model = base_model(case, progress=lambda now: report("refine", now))
-        else:
-            model = base_fit(case.train, case.base, case.config, report, start)
+        model = base_fit(case.train, case.base, case.config, report, start)
+    if split is not Split.BLOCKS:
         report("discretisation_error", None)
         both = None if case.both is None else with_same_step(case.both, model, fine)
         case = replace(case, train=with_step_difference(case.train, model, fine), both=both)

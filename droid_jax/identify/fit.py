@@ -14,7 +14,6 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.model.parameters import Parameter, Role, Space
 
 if TYPE_CHECKING:
-    from droid_jax.cost.residuals import CompareConfig
     from droid_jax.identify.checkpoints import Tree
 
 FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
@@ -106,16 +105,17 @@ class SearchProgress:
 
 
 def search_cost(
-    cost: Callable[[np.ndarray], Any], config: CompareConfig, full: Space, space: Space, at: np.ndarray | None = None
+    cost: Callable[[np.ndarray], Any], penalty: float, full: Space, space: Space, at: np.ndarray | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
     """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
 
+    penalty: what such a replay costs (`Comparison.penalty`).
     at: [D] where the other parameters stand; default: their means.
     """
 
     def searched(rows: np.ndarray) -> np.ndarray:
         found = np.asarray(cost(full.embed(space, rows, at)), np.float64)
-        return np.where(found == np.float32(config.non_finite_cost), np.inf, found)
+        return np.where(found == np.float32(penalty), np.inf, found)
 
     return searched
 

@@ -62,7 +62,8 @@ class IdentifyConfig:
         compare: how simulation and measurement are compared.
         channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
             those of `compare` where it names other ones, or weights, than its default, else what is informative
-            (`channels.informative_channels`): torque, or without it position and the object's angle.
+            (`channels.informative_channels`): torque, or without it position and the object's angle. Weights act in
+            the distance and the search alone; the refinement counts every channel by its noise.
         identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
         worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
             close and `HeldoutDistance.closed` is None.
@@ -307,7 +308,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     first = problem.early.first()
 
     found = cma_search(
-        search_cost(first, config.compare, full, space),
+        search_cost(first, first.comparisons[0].penalty, full, space),
         space,
         config.search,
         checkpoint_dir=checkpoints,

@@ -221,15 +221,18 @@ def traces(found: Identified) -> dict[str, np.ndarray]:
 
 
 def _of_channel(scene: Scene, channel: Measured, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
-    """A channel measured, with the spread of its repeats, and simulated [K, C]."""
+    """A channel measured, with the spread of its repeats, and simulated [K, C]; NaN where nothing was measured."""
     repeats = channel.noise.repeats
     joints = [scene.joints[c] for c in channel.columns]
-    return {
-        "time": channel.clock,
+    lines = {
         "measured_mean": channel.noise.mean,
         "measured_low": np.quantile(repeats, 0.05, axis=0),
         "measured_high": np.quantile(repeats, 0.95, axis=0),
         "before": before,
         "after": after,
+    }
+    return {
+        "time": channel.clock,
+        **{key: np.where(channel.noise.count > 0, line, np.nan) for key, line in lines.items()},
         "joints": np.array([scene.object_joint] if channel.name == "object_angle" else joints),
     }

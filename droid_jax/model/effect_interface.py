@@ -48,7 +48,8 @@ class State:
 class Rollout:
     """What a replay returns, for one sample (leading [P] when batched).
 
-    time:     [T] s, of the states the rest was computed from.
+    time:     [T] s, of the states the rest was computed from: from 0 in a servo replay, on the recording's clock along
+              a measured motion.  `cost.comparisons[i].clock` is the recording's clock in both.
     torque:   [T, J] N m (N for slides), in the recording's convention.
     position: [T, J] rad or m.
     velocity: [T, J] rad/s or m/s.

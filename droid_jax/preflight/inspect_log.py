@@ -48,7 +48,7 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
 def _replayable(scene: Scene, recording: Recording, motion_cutoff: float) -> None:
     """Raise ValueError where no replay can follow the recording; that it lacks commands `_notes` says."""
     if not recording.command.size:
-        measured_motion(recording, prescribed(scene, recording), cutoff=motion_cutoff)
+        measured_motion(recording, prescribed(scene, recording, motion_cutoff), cutoff=motion_cutoff)
     elif set(scene.needs_command) <= set(recording.command_names):
         make_drive(scene, recording, weigh="torque" in recording.channels)
 

@@ -124,9 +124,11 @@ def compiled_replay(
         mj_step: step as the C engine does.
 
     Raises:
-        ValueError: a measured motion with mj_step, what plain C does not have, gains that the scene does not have, or
-            a known value of a parameter that the space does not have or bounds.
+        ValueError: a measured motion with mj_step, what plain C does not have, gains that the scene does not have, a
+            model that was changed since MJX had it, or a known value of a parameter that the space does not have or
+            bounds.
     """
+    scene.check_unchanged()
     space.with_known(follows.known, space.mean)  # refused here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
@@ -171,6 +173,7 @@ def window_program(
 
     Of the drive only its time step and its torque's convention are used.
     """
+    scene.check_unchanged()
     check_gains(scene, drive)
     made_with = with_sensors(scene, space, drive, effects)
     clocked = Clocked(drive.timestep, drive.torque, drive)

@@ -24,16 +24,17 @@ from droid_jax.model.unsupported_features import refuse_fluid
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.runtime import first_device
 from droid_jax.simulate.closed_loops import coupled_to_others
-from droid_jax.simulate.measured_motion import Motion
+from droid_jax.simulate.measured_motion import CUTOFF, Motion, measured_throughout
 from droid_jax.simulate.replay import apply_sensor_model
 
 
-def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
+def prescribed(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
     """The joints whose measured motion a replay follows: the scene's, then all others that the log holds throughout.
 
     Torques are compared of the scene's joints alone, but what else moved carries them, or is carried.  All other joints
     stand still, where the recording states it (qpos0) or else as in the scene; one that carries a measured joint and is
-    not stated is warned of.
+    not stated is warned of, and so is one that was measured for a part of the time.
+    cutoff: Hz, of the filter of the positions, on which it depends which gaps are bridged.
     Raises ValueError where a joint of several degrees carries a measured one: a log does not tell how it moves.
     """
     floating = scene.floating(scene.joints)
@@ -49,7 +50,7 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
             "read the log with its commands (--command-topic of `convert`) or with positions"
         )
     channel = recording.channel("position")
-    whole = {j for i, j in enumerate(channel.columns) if channel.mask[:, :, i].any(axis=0).all()}
+    whole = measured_throughout(channel, cutoff)
     others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
     joints = (*scene.joints, *others)
     if coupled := coupled_to_others(scene, joints):
@@ -65,6 +66,14 @@ def prescribed(scene: Scene, recording: Recording) -> tuple[str, ...]:
         warnings.warn(
             f"recording {recording.name!r} does not hold the positions of {', '.join(still)} throughout, which carry "
             "measured joints: they are taken to stand still as in the scene (state where in qpos0)",
+            stacklevel=3,
+        )
+    seen = dict(zip(channel.columns, channel.mask.any(axis=(0, 1)), strict=True))
+    partly = [j for j in scene.single_joints if seen.get(j) and j not in (*joints, *still)]
+    if partly:
+        warnings.warn(
+            f"recording {recording.name!r} holds the positions of {', '.join(partly)} for a part of the time: they are "
+            "taken to stand still where they were first; cut the log (`convert --start S --end S`) to follow them",
             stacklevel=3,
         )
     return joints

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 
-from droid_jax.recordings.recording import Recording, TorqueConvention
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
-BRIDGED = 0.25  # periods of the cutoff: over gaps no longer than that positions are interpolated
+BRIDGED = 0.25  # periods of the cutoff: over gaps no longer than that positions are interpolated,
+LOST = 2.5  # nor, in a slow log, over gaps of so many usual steps: one lost sample
 CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
 REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
@@ -64,7 +65,7 @@ def measured_motion(
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
     A repeat that was not measured for a while keeps its distance from the others there (see `_common`); gaps of BRIDGED
-    periods of the cutoff are bridged.
+    periods of the cutoff, or of LOST steps, are bridged.
     The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz; velocity and acceleration are those
     of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
     A clock that jitters is made regular first, along a cubic spline.
@@ -81,15 +82,17 @@ def measured_motion(
             "a motion is prescribed for every measured joint (--joints)"
         )
     columns = [channel.columns.index(j) for j in joints]
-    values, mask = _bridged(channel.time, channel.values[:, :, columns], channel.mask[:, :, columns], BRIDGED / cutoff)
+    values, mask = _bridged(channel.time, channel.values[:, :, columns], channel.mask[:, :, columns], cutoff)
     if not mask.any(axis=0).all():
         row, column = np.argwhere(~mask.any(axis=0))[0]
         raise ValueError(
             f"recording {recording.name!r}, channel 'position', column {joints[column]!r}: not measured at "
-            f"{channel.time[row]:g} s; a motion needs every sample of at least one repeat"
+            f"{channel.time[row]:g} s; a motion needs every sample of at least one repeat: cut the log there "
+            "(`python -m droid_jax.run convert --start S --end S`)"
         )
     rate = (len(channel.time) - 1) / float(channel.time[-1] - channel.time[0])
-    if rate < 2.5 * cutoff:
+    usual = 1 / float(np.median(np.diff(channel.time)))  # a lost sample makes no slow log
+    if max(rate, usual * (1 + 1e-6)) < 2.5 * cutoff:
         raise ValueError(
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
@@ -123,9 +126,20 @@ def measured_motion(
     )
 
 
-def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, T, J] and their mask, with cubic splines over gaps of `longest` s at most."""
-    values, mask = values.copy(), mask.copy()
+def measured_throughout(channel: Channel, cutoff: float = CUTOFF) -> tuple[str, ...]:
+    """Columns of positions whose every sample some repeat holds, short gaps bridged as `measured_motion` does."""
+    _, mask = _bridged(channel.time, channel.values, channel.mask, cutoff)
+    return tuple(c for c, whole in zip(channel.columns, mask.any(axis=0).all(axis=0), strict=True) if whole)
+
+
+def _longest(time: np.ndarray, cutoff: float) -> float:
+    """s between two samples, at most, over which positions are interpolated."""
+    return max(BRIDGED / cutoff, LOST * float(np.median(np.diff(time))))
+
+
+def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [N, T, J] and their mask, with cubic splines over short gaps."""
+    values, mask, longest = values.copy(), mask.copy(), _longest(time, cutoff)
     for n, j in np.argwhere(~mask.all(axis=1)):
         seen = np.flatnonzero(mask[n, :, j])
         for gap in np.flatnonzero(np.diff(seen) > 1):
@@ -179,7 +193,7 @@ def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -
     usual, longest = float(steps.mean()), int(np.argmax(steps))
     if np.max(np.abs(steps - usual)) <= REGULAR * usual:
         return position
-    if steps[longest] * 2.5 * cutoff > 1:
+    if steps[longest] > max(1 / (2.5 * cutoff), _longest(time, cutoff)):
         raise ValueError(
             f"recording {name!r} holds no position for {steps[longest]:.3g} s from {time[longest]:g} s on, too long to "
             f"be smoothed at {cutoff:g} Hz; cut the log there or give --motion-cutoff (CompareConfig.motion_cutoff) "

@@ -122,14 +122,25 @@ def why_whole(scene: Scene, recording: Recording) -> str:
     return ""
 
 
+class TooShort(ValueError):
+    """A recording that is shorter than one window."""
+
+
 def cut(
-    scene: Scene, recording: Recording, drive: Drive, repeat: int, config: WindowConfig, grid: float | None = None
+    scene: Scene,
+    recording: Recording,
+    drive: Drive,
+    repeat: int,
+    config: WindowConfig,
+    grid: float | None = None,
+    number: int = 0,
 ) -> Windows:
     """Windows of a repeat one after the other, without those whose beginning was not measured (`why_whole` is empty).
 
     drive: what `make_drive` made of the recording.
     grid: s, that windows begin on, a whole number of the drive's time steps; None: one.
-    Raises ValueError where the motion is shorter than one window.
+    number: of windows in other repeats before these, so that places differ (`WindowConfig.every`).
+    Raises TooShort where the motion is shorter than one window.
     """
     channel, timestep = recording.channel("position"), drive.timestep
     grid = timestep if grid is None else grid
@@ -142,10 +153,10 @@ def cut(
     rows = np.arange(first, len(drive.command) - steps + 1, stride)
     if config.every is not None and len(rows):
         rows = first + finer * _spread(
-            (len(drive.command) - steps - first) // finer, stride // finer, config.every / grid
+            (len(drive.command) - steps - first) // finer, stride // finer, config.every / grid, number
         )
     if not len(rows):
-        raise ValueError(
+        raise TooShort(
             f"recording {recording.name!r} of {recording.duration:.3g} s is shorter than one window of "
             f"{config.length + config.lead + reach:.3g} s"
         )
@@ -169,15 +180,16 @@ def cut(
     return Windows(begin, table, gains, start, speed, spread, earlier, steps).kept(known)
 
 
-def _spread(last: int, least: int, every: float) -> np.ndarray:
+def _spread(last: int, least: int, every: float, number: int = 0) -> np.ndarray:
     """Places from 0 to `last`, one in each stretch of `every` and `least` apart or more.
 
-    Within their stretches by the golden ratio, so that a motion that repeats is not seen at one phase alone.
+    Within their stretches by the golden ratio, so that a motion that repeats is not seen at one phase alone; number: of
+    places before, in other motions.
     """
     count = max(1, min(round(last / every), last // least))
     begin = np.arange(count) * last / count
-    within = (0.5 * (np.sqrt(5.0) - 1.0) * (1 + np.arange(count))) % 1.0
-    return np.floor(begin + within * max(0.0, last / count - least)).astype(int)
+    within = (0.5 * (np.sqrt(5.0) - 1.0) * (1 + number + np.arange(count))) % 1.0
+    return np.floor(begin + within * (last / count - (least if count > 1 else 0.0))).astype(int)
 
 
 def start_spread(

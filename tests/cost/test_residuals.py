@@ -17,7 +17,9 @@ from droid_jax.cost import observation as measured
 from droid_jax.cost.replay_cache import Batched, cached
 from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
 from droid_jax.door.scene import door_scene
+from droid_jax.identify.fit import search_cost
 from droid_jax.model.effect_interface import Rollout
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Phase, Recording, TorqueConvention, TorqueSide
 
@@ -259,6 +261,24 @@ def test_of_a_drawer_only_the_measured_one_says_what_is_shut(door: Scene):
         assert bool(comparison.failed(door_rollout(object_angle=np.linspace(0, opened, STEPS)))) is shut
 
 
+def test_a_part_of_a_motion_in_which_nothing_opens_does_not_fail(door: Scene):
+    """It asked for five degrees, and for a grip at its last row: the truth failed as everything else did."""
+    still = door_rollout(object_angle=np.zeros(STEPS), contact=contact())
+    assert not door_comparison(door, angle=np.linspace(0, 0.01, STEPS)).failed(still)
+    later = np.where(CLOCK < 1.99, 0.0, 0.8)  # of the replay's own time alone
+    values = np.tile(later[:, None], (2, 1, 1))
+    data = recording(channel("object_angle", CLOCK, values, ["hinge"]), phases=PHASES)
+    torque = channel("torque", CLOCK, np.random.default_rng(0).normal(size=(2, STEPS, 1)), ["panda_joint1"])
+    data = replace(data, channels={**data.channels, "torque": torque})
+    assert make_comparison(door, data, CLOCK, CompareConfig()).failed(still)
+    assert not make_comparison(door, data, CLOCK[:900], CompareConfig()).failed(still)
+    shut = door_rollout(object_angle=np.zeros(STEPS), contact=np.zeros((STEPS, 2), bool))
+    to_the_grasp = (Phase("approach", 0.0, 0.4), Phase("grasp", 0.4, CLOCK[-1]))
+    assert not door_comparison(door, phases=to_the_grasp).failed(shut)
+    assert not door_comparison(door, phases=to_the_grasp[:1]).failed(shut)
+    assert door_comparison(door).failed(still)
+
+
 def test_a_log_without_commands_grips_and_opens_nothing(door: Scene):
     """Nothing was replayed that could have failed."""
     values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
@@ -283,6 +303,24 @@ def test_a_replay_that_blew_up_has_finite_costs(scene: Scene, whitened: bool):
         cost = float(comparison.distance(tried))
         assert np.isfinite(cost) and cost >= 999.9
         assert np.isnan(np.asarray(comparison.whitened(tried))).all()
+
+
+@pytest.mark.parametrize("config", [{"whitened": True}, {"channels": {"torque": 50.0}}], ids=["whitened", "weighed"])
+def test_a_replay_that_blew_up_costs_more_than_one_that_is_far_off(scene: Scene, config: dict):
+    """In units of the noise it was the cheapest row: 1000, where 100 N m beside the measurement cost more."""
+    values = np.random.default_rng(0).normal(0, 0.02, size=(4, STEPS, 3))
+    comparison = compare(scene, recording(channel("torque", CLOCK, values)), **config)
+    far, blown = rollout(torque=100.0 + 0 * smooth_traces(3, 1)), rollout(finite=np.array(False))
+    assert (
+        1000.0
+        < float(comparison.distance(far))
+        < float(comparison.distance(blown))
+        == pytest.approx(comparison.penalty)
+    )
+    space = Space((Parameter("x", "-", 0.0, 1.0, -1.0, 1.0),))
+    costs = np.array([comparison.distance(far), comparison.distance(blown)])
+    searched = search_cost(lambda rows: costs, comparison.penalty, space, space)(np.zeros((2, 1)))
+    assert np.isfinite(searched).tolist() == [True, False]
 
 
 # ----- whitened residuals
@@ -471,9 +509,9 @@ def test_joints_that_were_left_out_are_not_compared(scene: Scene):
     values[:, :, 1] = 0.0
     of = compare(replace(scene, joints=("c", "a")), recording(channel("torque", CLOCK, values)))
     measured = of.channel("torque")
-    np.testing.assert_array_equal(measured.columns, [1, 0])  # a and c, in the recording's order
+    np.testing.assert_array_equal(measured.columns, [0, 1])  # c and a, in the scene's order
     alone = compare(scene, recording(channel("torque", CLOCK, values[:, :, [0, 2]], ("a", "c"))))
-    np.testing.assert_allclose(measured.noise.mean, alone.channel("torque").noise.mean)
+    np.testing.assert_allclose(measured.noise.mean[:, ::-1], alone.channel("torque").noise.mean)
 
 
 def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
@@ -481,6 +519,49 @@ def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
     mask = np.ones(values.shape, bool)
     mask[:, 200:600, 1] = False
     with pytest.raises(ValueError, match=r"'torque', column 'b' has a stretch that no repeat measured, at 0\.45 s"):
+        compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
+
+
+@pytest.mark.parametrize("stamps", [True, False], ids=["masked", "without stamps"])
+def test_a_dropout_of_one_repeat_is_left_out(scene: Scene, stamps: bool):
+    """Five lost samples of a 50 Hz log were refused, and `check` called them harmless.
+
+    A trace's size is fitted: with the dropout as without, whatever stands there, and with a restated noise too.
+    """
+    slow = np.arange(0.0, 2.0, 0.02)
+    shape = smooth_traces(3, 1)
+    at = np.stack([np.interp(slow, CLOCK, column) for column in shape.T], axis=1)
+    values = (2.0 * at + np.random.default_rng(0).normal(0, 0.05, at.shape))[None]
+    lost = np.zeros(len(slow), bool)
+    lost[40:45] = True
+
+    def sizes(data: Channel) -> tuple[list[float], list[int]]:
+        found, zeros = [], []
+        made = compare(scene, recording(data))
+        for one in (made, made.stated({"torque": np.full(3, 0.3)})):
+            ends = [np.asarray(one.whitened(rollout(torque=size * shape)), float) for size in (0.0, 1.0)]
+            found.append(float(-ends[0] @ (ends[1] - ends[0]) / np.sum((ends[1] - ends[0]) ** 2)))
+            zeros.append(int(np.sum(ends[0] == 0)))
+        return found, zeros
+
+    whole, none = sizes(channel("torque", slow, values))
+    tries = []
+    for there in (np.nan, 0.0, 1e6):
+        data = np.where(lost[:, None], there, values)
+        mask = np.broadcast_to(~lost[:, None], values.shape)
+        kept = np.ones(len(slow), bool) if stamps else ~lost
+        tries.append(sizes(channel("torque", slow[kept], data[:, kept], mask=mask[:, kept])))
+    assert none == [0, 0] and all(part[1][0] == part[1][1] > 0 for part in tries)
+    assert all(part == tries[0] for part in tries)
+    np.testing.assert_allclose(tries[0][0], whole, atol=5e-3)
+    np.testing.assert_allclose(whole, 2.0, atol=0.02)
+
+
+def test_a_column_that_one_repeat_hardly_measured_is_refused(scene: Scene):
+    values = np.random.default_rng(0).normal(size=(1, STEPS, 3))
+    mask = np.ones(values.shape, bool)
+    mask[:, 60:, 1] = False
+    with pytest.raises(ValueError, match="'torque', column 'b' was measured for less than 10 % of the time"):
         compare(scene, recording(channel("torque", CLOCK, values, mask=mask)))
 
 

@@ -69,6 +69,15 @@ def test_the_finer_simulation_has_a_quarter_of_the_step(found: Small, monkeypatc
     assert fine.model.opt.timestep == pytest.approx(found.scene.model.opt.timestep / 4)
 
 
+def test_data_of_mj_steps_own_steps_have_no_step_error(found: Small):
+    """A finer step would be the error of the very step that made the data, and U0 hid what was missing."""
+    train = found.case.train
+    (comparison,) = train.cost.comparisons
+    made = replace(comparison, config=replace(comparison.config, mj_step=True))
+    own = replace(train, cost=replace(train.cost, comparisons=(made,)))
+    assert with_finer_step(own, found.base.space, found.recordings["train"]) is None
+
+
 def test_inverse_dynamics_has_no_time_step(found: Small):
     train = found.case.train
     measured: Any = (object(),)

@@ -15,6 +15,7 @@ import numpy as np
 import pendulum as made
 import pytest
 from pendulum import TRUE, pendulum, swung
+from two_link import JOINTS, arm, measured, recording
 
 import droid_jax as dj
 from droid_jax.cost.log_piece import shared_steps
@@ -27,6 +28,7 @@ from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
 from droid_jax.model.effects.registry import library
+from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene, with_options
@@ -106,7 +108,7 @@ def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases()
     assert len(places) == 20 and places.min() >= 0 and places.max() <= last
     np.testing.assert_array_equal(places // 600, np.arange(20))
     assert np.diff(places).min() >= least and len(np.unique(places % 600)) == 20
-    np.testing.assert_array_equal(_spread(90, 40, 200.0), [30])
+    np.testing.assert_array_equal(_spread(90, 40, 200.0), [55])
     crowded = _spread(2300, 1500, 1500.0)  # 2300 / 1500 rounds up
     assert len(crowded) == 1 or np.diff(crowded).min() >= 1500
 
@@ -121,6 +123,20 @@ def test_windows_that_are_left_out_are_not_compared(space: Space):
     assert np.sqrt(np.mean(log.residual(space.values(TRUE)) ** 2)) < 2 * NOISE
     finer = log.finer(with_options(scene(), timestep=0.002), space)
     np.testing.assert_allclose(finer.pieces[0].windows.begin, log.pieces[0].windows.begin)
+
+
+def test_short_logs_have_windows_at_different_places_and_some_are_test_data(space: Space):
+    """Each gave one window, at its very beginning, and all of them trained; one that is too short ended all."""
+    config, windows = CompareConfig(channels={"position": 1.0}), replace(SHORT, length=1.0, every=1.0)
+    logs = [replace(swung("a", 1.0, 0.7), name=name) for name in "abc"]
+    stub = replace(logs[0].window(0.0, 1.0), name="stub")
+    log = windowed_log(scene(), space, [logs[0], stub, *logs[1:]], config, windows, fitted_share=2 / 3)
+    begin = np.concatenate([piece.windows.begin for piece in log.pieces])
+    assert len(begin) == 3 and np.diff(np.sort(begin)).min() > 0.1 and begin.max() > 0.6
+    assert (log.fitted, log.unit.max() + 1) == (2, 3) and log.too_short == ("stub",)
+    assert log.comparisons[0].name == "a and b and c"
+    with pytest.raises(ValueError, match="'stub' of 1 s is shorter than one window"):
+        windowed_log(scene(), space, [stub], config, windows)
 
 
 class Caught(Exception):
@@ -172,6 +188,29 @@ def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monk
             log_case.windowed_case(scene(), space, *asked, (), config, start)
     expected = [space.to_search(v) for v in (space.mean, np.array([0.2, 0.1]))]
     np.testing.assert_allclose(begun, expected)
+
+
+def test_windows_of_mj_steps_own_steps_are_refused(space: Space):
+    """They were replayed by steps of second order, whatever was asked for."""
+    config = CompareConfig(channels={"position": 1.0}, mj_step=True)
+    with pytest.raises(ValueError, match=r"mj_step is for repeats .* leave mj_step out"):
+        windowed_log(scene(), space, [swung("a", 1.0, 0.7)], config, SHORT)
+
+
+def test_columns_in_another_order_are_the_same_joints():
+    """Logs of one robot were refused where a program wrote its joints in another order."""
+    space = Space((joint_damping(arm(), "elbow", std=0.1, high=50.0),))
+    first = recording(channels={"position": measured(0.0)["position"]}).repeats_subset([0])
+    position, config = first.channels["position"], CompareConfig(channels={"position": 1.0})
+    turned = replace(position, columns=JOINTS[::-1], values=position.values[..., ::-1], mask=position.mask[..., ::-1])
+    second = replace(first, name="turned", channels={"position": turned})
+    log = windowed_log(arm(), space, [first, second], config, SHORT)
+    assert [piece.columns["position"].tolist() for piece in log.pieces] == [[0, 1], [0, 1]]
+    np.testing.assert_allclose(log.pieces[0].measured, log.pieces[1].measured)
+    alone = replace(position, columns=JOINTS[:1], values=position.values[..., :1], mask=position.mask[..., :1])
+    one = replace(first, name="one", channels={"position": alone})
+    with pytest.raises(ValueError, match=r"different joints: wave of shoulder, elbow; one of shoulder; .*--joints sho"):
+        windowed_log(arm(), space, [first, one], config, SHORT, whole=True)
 
 
 # ----- what windows leave

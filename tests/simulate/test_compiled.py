@@ -9,16 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import pendulum, swung
 from two_link import MOTOR, arm, motion, recording
 
 from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.door.space import torque_offsets
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate import compiled
 from droid_jax.simulate.batching import time_loop
+from droid_jax.simulate.replay import make_drive, servo_replay
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +135,37 @@ def test_starts_of_their_own_and_no_steps():
     loop, starts = summed([]), jnp.array([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(jax.vmap(lambda r, s: loop(r, s, 0))(RATES, starts), starts)
     np.testing.assert_array_equal(jax.vmap(lambda r, s: loop(r, s, 2))(RATES, starts), starts + RATES + 4.0)
+
+
+def test_a_loop_has_forward_derivatives():
+    """jax.jacfwd raised: its rows differ in their tangents, and the loop called its unbatched result a batch."""
+
+    def ended(x: jax.Array) -> jax.Array:
+        return time_loop(lambda rate, k, now: now * rate, x[0], x[1], 3)  # x1 x0^3
+
+    x = jnp.array([2.0, 0.5])
+    np.testing.assert_allclose(jax.jacfwd(ended)(x), [3 * 0.5 * 4.0, 8.0])
+    np.testing.assert_allclose(jax.vmap(jax.jacfwd(ended))(jnp.stack([x, 2 * x])), [[6.0, 8.0], [48.0, 64.0]])
+
+
+@pytest.mark.slow
+def test_the_documented_replay_has_forward_derivatives():
+    """docs/your-robot.md: of positions by a damping against differences, and of torques by an offset: it is read."""
+    scene = pendulum()
+    space = Space((joint_damping(scene, "swing", std=0.05, high=1.0), *torque_offsets(scene.joints)))
+    drive = make_drive(scene, swung("a", 1.0, 0.7))
+    replay = servo_replay(scene, drive, compiled.with_sensors(scene, space, drive, ()))
+
+    def traces(values: jax.Array) -> jax.Array:
+        rollout = replay(make_physics(scene, space, values))
+        return jnp.stack([rollout.position[:, 0], rollout.torque[:, 0]])
+
+    at, step = jnp.asarray(space.mean, jnp.float32), jnp.array([1e-3, 0.0])
+    slopes = np.asarray(jax.jit(jax.jacfwd(traces))(at))
+    both = jax.jit(jax.vmap(traces))(jnp.stack([at + step, at - step]))
+    expected = np.asarray(both[0, 0] - both[1, 0]) / 2e-3
+    np.testing.assert_allclose(slopes[0, :, 0], expected, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(slopes[1, :, 1], 1.0)
 
 
 def test_rows_with_different_numbers_of_steps_are_refused():

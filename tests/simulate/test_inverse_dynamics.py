@@ -201,7 +201,7 @@ def log(columns: Sequence[str], holes: bool = False) -> Recording:
     time = np.arange(0.0, 2.0, 0.005)
     values = np.stack([1.0 + 0.5 * np.sin(1.5 * time), 0.4 * np.sin(2.0 * time)], axis=1)[None, :, : len(columns)]
     mask = np.ones(values.shape, bool)
-    mask[:, 100, 0] = not holes
+    mask[:, 100:120, 0] = not holes
     channels = {"position": Channel("position", "rad", tuple(columns), time, values, mask)}
     return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(LINK, True), qpos0={})
 
@@ -226,6 +226,23 @@ def test_a_carrier_without_positions_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert prescribed(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
+
+
+def test_a_carried_joint_with_holes_in_its_positions_is_warned_of():
+    """One lost sample had it stand at its first position for the whole log, without a word."""
+    part, whole = planar(joints=["a"]), log(["a", "b"])
+    mask = whole.channels["position"].mask.copy()
+
+    def holed() -> Recording:
+        return replace(whole, channels={"position": replace(whole.channels["position"], mask=mask)})
+
+    mask[:, 100, 1] = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert prescribed(part, holed()) == ("a", "b")
+    mask[:, 100:120, 1] = False
+    with pytest.warns(UserWarning, match=r"positions of b for a part of the time: .*--start S --end S"):
+        assert prescribed(part, holed()) == ("a",)
 
 
 @pytest.mark.parametrize("part", ["command", "servo"])
@@ -305,7 +322,7 @@ def test_a_carrier_with_a_hole_in_its_positions_is_warned_of_though_its_start_is
     path = log.channels["position"]
     values = np.concatenate([path.values, path.values], axis=2)
     mask = np.ones(values.shape, bool)
-    mask[:, 100, 1] = False
+    mask[:, 100:120, 1] = False
     holed = replace(path, columns=("arm", "torso"), values=values, mask=mask)
     with pytest.warns(UserWarning, match="the positions of torso throughout"):
         assert prescribed(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)

@@ -98,12 +98,24 @@ def test_a_short_gap_is_bridged():
     np.testing.assert_allclose(motion.acceleration, sines(motion.time, 2), atol=0.3)
 
 
+@pytest.mark.parametrize("stamps", [True, False], ids=["masked", "without stamps"])
+def test_a_lost_sample_of_a_slow_log_is_bridged(stamps: bool):
+    """At 50 Hz two steps are more than a quarter of the cutoff's period, and the log was refused."""
+    time = TIME[::20]
+    mask = np.ones((1, len(time), 2), bool)
+    mask[0, 133] = False
+    kept = np.ones(len(time), bool) if stamps else mask[0, :, 0]
+    motion = measured_motion(log(sines(time)[None, kept], time[kept], mask[:, kept]), JOINTS)
+    np.testing.assert_allclose(motion.position, sines(motion.time), atol=1e-3)
+    np.testing.assert_allclose(motion.acceleration, sines(motion.time, 2), atol=0.3)
+
+
 def test_what_cannot_be_a_motion_is_refused():
     with pytest.raises(ValueError, match="lack wrist"):
         measured_motion(log(sines(TIME)[None]), ("a", "wrist"))
     mask = np.ones((1, len(TIME), 2), bool)
     mask[0, 1234:1250, 1] = False  # of a longer time than a quarter of the cutoff's period
-    with pytest.raises(ValueError, match=r"column .b.: not measured at 1\.234 s"):
+    with pytest.raises(ValueError, match=r"column .b.: not measured at 1\.234 s; .*convert --start S"):
         measured_motion(log(sines(TIME)[None], mask=mask), JOINTS)
     slow = TIME[::40]
     with pytest.raises(

@@ -17,6 +17,7 @@ from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.space import torque_offsets
 from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import joint_damping, servo_scale, time_offset
 from droid_jax.model.joint_friction import joint_friction_effect, joint_friction_space
 from droid_jax.model.parameters import Scaling, Space
@@ -475,6 +476,13 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
     np.testing.assert_allclose(moved.torque, anew.torque, atol=1e-4)
 
 
+def test_a_cost_keeps_its_steps(scene: Scene):
+    """Against another config, mj_step was not what had been asked for, and nobody was told."""
+    cost = make_cost(scene, SPACE, recording(), config=CompareConfig(mj_step=True))
+    with pytest.raises(ValueError, match="compiled with another mj_step"):
+        cost.against([recording()], CompareConfig())
+
+
 @pytest.mark.slow
 def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
     friction = joint_friction_space(JOINTS).select(["coulomb[elbow]"])
@@ -531,6 +539,31 @@ def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
 
 
 # ----- what is refused
+
+
+def test_friction_effects_without_a_friction_row_are_refused():
+    """0 and 5 N m gave the same cost, without a word: MJX has friction rows only where it compiled friction."""
+    bare = arm()
+    effects = library(bare, ["joint_coulomb"])
+    with pytest.raises(ValueError, match=r"'joint_coulomb' raises dry friction of shoulder, elbow, .*ready\(scene\)"):
+        make_cost(bare, effect_space(effects), recording(), effects=effects)
+    one = effect_space(effects).select(["joint_coulomb[elbow]"])
+    with pytest.raises(ValueError, match="raises dry friction of elbow, which"):
+        make_cost(bare, one, recording(), effects=effects)
+    make_cost(ready(bare), one, recording(), effects=effects)
+    make_cost(bare, SPACE, recording(), effects=effects)  # at neutral, where they do nothing
+
+
+def test_a_model_that_was_changed_after_it_was_compiled_is_refused():
+    """MJX kept the old numbers, and all that is read from the model had the new ones: a mixture, without a word."""
+    scene = arm()
+    scene.model.dof_damping[:] = 2.0  # before it is compiled nothing is mixed
+    make_cost(scene, SPACE, recording())
+    other = with_options(scene, timestep=0.004)
+    scene.model.opt.timestep = 0.004
+    with pytest.raises(ValueError, match=r"model of scene 'arm' was changed after it was .*with_options"):
+        make_cost(scene, SPACE, recording())
+    make_cost(other, SPACE, recording())
 
 
 def test_a_recording_without_commands_is_refused(scene: Scene):
