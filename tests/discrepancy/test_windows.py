@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pendulum as made
 import pytest
@@ -21,12 +22,12 @@ from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
-from droid_jax.discrepancy.candidates import observable_effects
+from droid_jax.discrepancy.candidates import SMALL, observable_effects
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.model.effects.registry import library
+from droid_jax.model.effects.registry import joined, library
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene, with_options
@@ -204,6 +205,24 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert part.distances(truth[None])[0, 0] == pytest.approx(np.mean(np.abs(left[some])), rel=1e-3)
     (rollout,) = log.rollouts(truth[None])
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
+
+
+def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
+    """A goal that may move by 0.7 rad/s lags for longer than delays do: it began at rest on the last goals alone.
+
+    The size is that of the score test, at which slow commands must be limited.
+    """
+    effects = library(scene(), ["profile_speed"])
+    whole, theta = joined(space, effects), {"profile_speed[swing]": SMALL * effects[0].parameters[0].std}
+    assert effects[0].profile is not None and theta["profile_speed[swing]"] == pytest.approx(1.5)
+    log = log_of(whole, [swung("a", 1.0, 0.7)], effects=effects)
+    windows, command = log.pieces[0].windows, log.drives[0].command
+    path = np.asarray(effects[0].profile(theta, jnp.asarray(command), 0.004))
+    assert np.abs(path - command).max() > 0.2
+    for begin, table in zip(windows.begin, windows.table, strict=True):
+        first = round(begin / 0.004)
+        drawn = effects[0].profile(theta, jnp.asarray(table), 0.004)[windows.earlier :]
+        np.testing.assert_allclose(drawn, path[first : first + windows.steps], atol=1e-4)
 
 
 @pytest.mark.slow
