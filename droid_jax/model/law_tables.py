@@ -22,7 +22,8 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.table_grid import ROUNDING, GridAxis, error, first_nodes, on_grid, refined
 
 SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
-LOAD = 20.0  # N m: likewise, where no force limit says it
+LOAD = 2000.0  # N m: likewise, where no force limit says it; nodes are closer about zero, so that far costs nothing
+USUAL_LOAD = 20.0  # N m: a torque that is rounded off about as a servo's feedback is
 RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
 FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
@@ -222,9 +223,11 @@ class _Law:
             return batch(given, x, np.full(len(x), q), np.full(len(x), v))
 
         reach = self._load_reach(joint)
-        probes = np.linspace(-reach, reach, 41)
-        at = {n: np.full(41, self.probe(n)) for n in self.parameters}
-        if np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)).max() > 1e-4 * reach:
+        half = reach * np.geomspace(1e-3, 1.0, 20)
+        probes = np.concatenate([-half, [0.0], half])
+        at = {n: np.full(len(probes), self.probe(n)) for n in self.parameters}
+        rounded = 1e-4 * np.maximum(np.abs(probes), min(reach, USUAL_LOAD))
+        if np.any(np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)) > rounded):
             return self.without("it depends on more than the servo's torque")
         unit = UNIT["torque"][self.scene.slides(joint)]
         return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],

@@ -24,7 +24,7 @@ from droid_jax.identify.neutral_result import with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.effects.registry import effect_space, joined, library, ready
 from droid_jax.model.fields import joint_damping
-from droid_jax.model.law_tables import NoTable, law_tables
+from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
@@ -224,6 +224,20 @@ def test_a_law_that_has_no_table_is_named_and_nothing_is_lost(made: Made):
         effect = Effect("own", (parameter,), force=force, locations={"elbow": ("size",)})
         (found,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {"size": 0.1})
         assert isinstance(found, NoTable) and said in found.why
+
+
+def table_of(made: Made, name: str, values: dict[str, float]) -> LawTable | NoTable:
+    """Of an effect of the library at one joint, at values that are known."""
+    found = list(law_tables(made.scene, made.scene.mjx, library(made.scene, [name]), values, {}))
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_law_of_load_goes_as_far_as_loads_do(made: Made):
+    """Where no force limit says how far; it stopped at 20 N m without a word."""
+    table = table_of(made, "load_friction", {"load_friction[elbow]": 0.1})
+    assert isinstance(table, LawTable) and table.axes[0].name == "load" and table.error < 1e-3
+    np.testing.assert_allclose(np.interp([0.05, 300.0], table.axes[0].nodes, table.terms[0][1]), [0.05, 300.0])
 
 
 def test_commands_come_late(made: Made):
