@@ -27,6 +27,7 @@ USUAL_LOAD = 20.0  # N m: a torque that is rounded off about as a servo's feedba
 RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
 FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
+NARROW = 1e-3  # of the probed range: as many states again lie closer and closer, for laws that act in little of it
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
 
@@ -173,9 +174,10 @@ class _Law:
         scene, nv = self.scene, self.scene.model.nv
         function = self._batched(acts)
         rng = np.random.default_rng(0)
-        base = np.concatenate([np.tile(scene.model.qpos0, (PROBES, 1)), np.zeros((PROBES, 2 * nv))], axis=1)
-        base = base + rng.uniform(-0.5, 0.5, base.shape)
-        at = {n: np.full(PROBES, self.probe(n)) for n in self.parameters}
+        scale = np.concatenate([np.ones(PROBES), np.geomspace(NARROW, 1.0, PROBES)])
+        base = np.tile(np.concatenate([scene.model.qpos0, np.zeros(2 * nv)]), (len(scale), 1))
+        base = base + scale[:, None] * rng.uniform(-0.5, 0.5, base.shape)
+        at = {n: np.full(len(scale), self.probe(n)) for n in self.parameters}
         now = function(at, base)
         if not np.abs(now).max() > 0:
             yield self.without("it does not act near the scene's own pose, where its table would be made")
@@ -183,7 +185,7 @@ class _Law:
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
             other = base.copy()
-            other[:, column] += rng.uniform(0.1, 0.6, PROBES) * rng.choice([-1, 1], PROBES)
+            other[:, column] += rng.uniform(0.1, 0.6, len(scale)) * rng.choice([-1, 1], len(scale))
             moved = np.abs(function(at, other) - now).max(axis=0) > CHANGE * max(np.abs(now).max(), 1e-9)
             for dof in np.flatnonzero(moved):
                 touched.setdefault(int(dof), set()).add((variable, row))

@@ -240,6 +240,19 @@ def test_a_law_of_load_goes_as_far_as_loads_do(made: Made):
     np.testing.assert_allclose(np.interp([0.05, 300.0], table.axes[0].nodes, table.terms[0][1]), [0.05, 300.0])
 
 
+STRIBECK = {"joint_stribeck[shoulder]": 0.2, "joint_stribeck_speed": 0.005, "joint_stribeck_exponent": 2.0}
+LATCH = {"latch_torque": 0.2, "latch_width": 0.01, "latch_exponent": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "variable"), [("joint_stribeck", STRIBECK, "speed"), ("latch", LATCH, "position")]
+)
+def test_a_law_that_acts_in_a_narrow_range_has_a_table(made: Made, name: str, values: dict[str, float], variable: str):
+    """Friction within some mrad/s, a latch within a hundredth of a radian: no probe came so near."""
+    table = table_of(made, name, values)
+    assert isinstance(table, LawTable) and table.axes[-1].name == variable
+
+
 def test_commands_come_late(made: Made):
     laws, model, _ = laws_of(made, None)
     data, got = mujoco.MjData(model), []
