@@ -27,6 +27,7 @@ USUAL_LOAD = 20.0  # N m: a torque that is rounded off about as a servo's feedba
 RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
 FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
+COARSEST = 0.1  # of a table's largest value, by which it may miss its law at the fitted values
 NARROW = 1e-3  # of the probed range: as many states again lie closer and closer, for laws that act in little of it
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
@@ -235,7 +236,9 @@ class _Law:
         return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],
                           lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
 
-    def _table(self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]) -> LawTable:
+    def _table(
+        self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]
+    ) -> LawTable | NoTable:
         scene, model = self.scene, self.scene.model
         acting, of = (model.joint(int(model.dof_jntid[d])).name for d in (dof, row))
         slides = model.jnt_type[model.dof_jntid[row]] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -251,7 +254,9 @@ class _Law:
         assert acting == of or acts == "force"
         return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
 
-    def _made(self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> LawTable:
+    def _made(
+        self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]
+    ) -> LawTable | NoTable:
         """Terms by linear coefficients; all other parameters are axes of the table."""
         names, values = self.parameters, self.values
         linear = [n for n in names if n in self.coefficients and self._linear(n, axes, at)]
@@ -286,6 +291,8 @@ class _Law:
         ]
         at_fitted = [error(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
         own = float(np.dot(sizes, at_fitted))
+        if own > COARSEST * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
+            return self.without(f"a table of {len(every[-1].nodes)} nodes is too coarse for it")
         effect = self.effect
         return LawTable(
             effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst

@@ -253,6 +253,20 @@ def test_a_law_that_acts_in_a_narrow_range_has_a_table(made: Made, name: str, va
     assert isinstance(table, LawTable) and table.axes[-1].name == variable
 
 
+def test_a_ripple_has_a_table_where_its_periods_have_nodes(made: Made):
+    """Two nodes a period were nothing like it, and nothing said so; at all of them a ripple may be zero, too."""
+    ripple = {"ripple_sine[elbow]": 0.3, "ripple_periods": 64.0}
+    table = table_of(made, "torque_ripple", ripple)
+    assert isinstance(table, LawTable) and table.error < 0.03
+
+    def quick(theta: Any, state: Any) -> Any:
+        return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * jnp.sin(3000.0 * state.qpos[0]))
+
+    effect = Effect("quick", (Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0),), force=quick)
+    (none,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {})
+    assert isinstance(none, NoTable) and "too coarse" in none.why
+
+
 def test_commands_come_late(made: Made):
     laws, model, _ = laws_of(made, None)
     data, got = mujoco.MjData(model), []
