@@ -153,10 +153,14 @@ class _Law:
         command = self.effect.command
         assert command is not None
 
+        names, at = self.parameters, {n: self.values[n] for n in self.parameters}
+        none = "it does more to the command than to delay it"
+        if np.ndim(command(self.theta(at), jnp.float32(1.0), lambda t: t)):  # each actuator's by itself
+            return self.without(none)
+
         def late(given: dict[str, float], power: int) -> float:
             return float(command(self.theta(given), jnp.float32(1.0), lambda t: t**power))
 
-        names, at = self.parameters, {n: self.values[n] for n in self.parameters}
         found = [1.0 - late({**dict.fromkeys(names, 0.0), n: 1e-3}, 1) for n in names]
         whole = 1.0 - late(at, 1)
         shares = np.array(found) / 1e-3
@@ -164,7 +168,7 @@ class _Law:
             abs(float(shares @ [at[n] for n in names]) - whole) < 1e-5 and abs((1 - whole) ** 2 - late(at, 2)) < 1e-5
         )
         if not straight:
-            return self.without("it does more to the command than to delay it")
+            return self.without(none)
         terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, shares, strict=True) if s)
         return LawTable(
             self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0, 0.0
@@ -180,6 +184,9 @@ class _Law:
         base = base + scale[:, None] * rng.uniform(-0.5, 0.5, base.shape)
         at = {n: np.full(len(scale), self.probe(n)) for n in self.parameters}
         now = function(at, base)
+        if np.any(function(at, np.concatenate([base, rng.uniform(-0.5, 0.5, (len(scale), 2 * nv))], axis=1)) != now):
+            yield self.without("it depends on what motor and links put onto the gear")
+            return
         if not np.abs(now).max() > 0:
             yield self.without("it does not act near the scene's own pose, where its table would be made")
             return
@@ -312,12 +319,13 @@ class _Law:
         return bool(np.abs(none).max() <= slack and np.abs(two - 2 * one).max() <= slack and parts <= slack)
 
     def _batched(self, acts: str) -> Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]:
-        """(parameters [K] each, states [K, nq + nv + nv]) -> [K, nv]."""
+        """(parameters [K] each, states [K, nq + nv + nv], with the gear's torques 2 nv more) -> [K, nv]."""
         nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.model
         raised = jnp.full(nv, RAISED, jnp.float32)
 
         def one(given: dict[str, Any], row: Any) -> Any:
-            state = State(jnp.float32(0), row[:nq], row[nq : nq + nv], row[nq + nv :], model)
+            position, speed, load, gear = jnp.split(row, (nq, nq + nv, nq + 2 * nv))
+            state = State(jnp.float32(0), position, speed, load, model, gear=gear.reshape(2, nv))
             theta = self.theta(given)
             if acts == "force":
                 assert self.effect.force is not None
@@ -325,7 +333,12 @@ class _Law:
             assert self.effect.frictionloss is not None
             return self.effect.frictionloss(theta, state, raised) - raised
 
-        return _padded(one)
+        batch, wide = _padded(one), nq + 4 * nv
+
+        def of(given: dict[str, np.ndarray], states: np.ndarray) -> np.ndarray:
+            return batch(given, np.pad(states, ((0, 0), (0, wide - states.shape[1]))))
+
+        return of
 
     def _columns(self) -> Iterator[tuple[int, str, int]]:
         """(column of a state, variable, degree of freedom), of joints of one degree."""

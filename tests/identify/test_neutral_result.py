@@ -267,6 +267,22 @@ def test_a_ripple_has_a_table_where_its_periods_have_nodes(made: Made):
     assert isinstance(none, NoTable) and "too coarse" in none.why
 
 
+GEARED = {"gear_motor[elbow]": 0.2, "gear_links[elbow]": 0.1, "gear_at_rest[elbow]": 0.0, "gear_speed": 0.7}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("velocity_feedforward", {"velocity_feedforward[elbow]": 0.02}, "more to the command than to delay it"),
+        ("gear_friction", GEARED, "what motor and links put onto the gear"),
+    ],
+)
+def test_why_a_law_has_no_table_is_said_in_words(made: Made, name: str, values: dict[str, float], why: str):
+    """Not as the error of a program that took a row for a number, or nothing for a gear."""
+    none = table_of(made, name, values)
+    assert isinstance(none, NoTable) and why in none.why
+
+
 def test_commands_come_late(made: Made):
     laws, model, _ = laws_of(made, None)
     data, got = mujoco.MjData(model), []
