@@ -15,9 +15,10 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects import registry
 from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
-from droid_jax.model.mjcf import native
-from droid_jax.model.parameters import Parameter
-from droid_jax.model.physics import make_physics
+from droid_jax.model.fields import body_mass
+from droid_jax.model.mjcf import fitted_mjcf, native
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import HARD, TINY_FRICTIONLOSS, Scene, compile_scene, load_scene
 from droid_jax.simulate.replay import Drive, servo_replay
 
@@ -266,6 +267,17 @@ def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Ben
 
 def test_it_is_gone_afterwards():
     assert "wind" not in registered()
+
+
+def test_a_payload_is_kilograms_beside_a_fitted_mass():
+    """In MJX, in C, and in the MJCF; it was a share of the model's mass, times the fitted one."""
+    scene = edited(MECHANISM, MECHANISM.replace(' gravcomp="1"', ""))
+    (payload,) = library(scene, ["payload"])
+    space = Space((body_mass(scene, "hand", std=0.1, high=2.0),)) + effect_space([payload])
+    values, hand = space.values({"hand_mass": 0.9, "payload_mass": 0.25}), scene.id("body", "hand")
+    made = make_physics(scene, space, jnp.asarray(values, jnp.float32)).model, make_c_model(scene, space, values)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, values, [payload]))
+    np.testing.assert_allclose([model.body_mass[hand] for model in (*made, written)], 1.15, rtol=1e-6)
 
 
 # ----- rows of friction
