@@ -629,6 +629,17 @@ def test_firm_friction_holds_what_mujocos_lets_creep():
         path(1.5)
 
 
+def test_firm_friction_leaves_what_other_effects_add(scene: Scene):
+    """It is a share of the joint's own; it took that share of all that had been added before it."""
+    live, firm = live_at(scene), made(scene, "firm_friction", 0.8)
+    firm.begin(live)  # type: ignore[misc]
+    own = live.loss.copy()
+    live.loss[:] = own + 0.5
+    firm.step(live)  # type: ignore[misc]
+    np.testing.assert_allclose(live.loss, 0.2 * own + 0.5)
+    assert own.max() == pytest.approx(0.1)
+
+
 # ----- signals
 
 
