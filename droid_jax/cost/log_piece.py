@@ -28,6 +28,7 @@ from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
 LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
+ALIKE = 1.01  # the same where sensors err with time, centred on the replay's clock: what is added would be an offset
 MANY = 8  # windows of a sample from which its batches always have many rows
 TRACES = ("torque", "position", "velocity", "object_angle")
 
@@ -185,11 +186,12 @@ def _blocks(
         yield Rollout(*(np.asarray(getattr(rollout, f.name))[:count] for f in fields(rollout))), rows[:count]
 
 
-def shared_steps(steps: Sequence[int]) -> list[int]:
+def shared_steps(steps: Sequence[int], effects: Sequence[Effect] = ()) -> list[int]:
     """How long each of some motions is replayed, at least its own steps: few different numbers."""
+    longer = ALIKE if any(e.over_time and e.observe is not None for e in effects) else LONGER
     found, longest = [0] * len(steps), 0
     for i in sorted(range(len(steps)), key=lambda i: -steps[i]):
-        longest = longest if steps[i] <= longest <= LONGER * steps[i] else steps[i]
+        longest = longest if steps[i] <= longest <= longer * steps[i] else steps[i]
         found[i] = longest
     return found
 

@@ -258,7 +258,7 @@ def windowed_log(
         drive = followed(scene, recording, config)
         assert isinstance(drive, Drive)
         drives.append(drive)
-    lasting = shared_steps([len(drive.command) for drive in drives])
+    lasting = shared_steps([len(drive.command) for drive in drives], effects)
     made = list[Piece | None]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):

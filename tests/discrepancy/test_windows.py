@@ -252,6 +252,14 @@ def test_motions_of_about_one_length_are_replayed_together(space: Space):
     assert both.pieces[0].program is both.pieces[1].program
 
 
+def test_a_drift_is_centred_on_the_motion_itself(space: Space):
+    """Not on the longer one of which it shares a program, or it would be an offset besides."""
+    drift = library(scene(), ["torque_drift"])
+    log = whole_log(joined(space, drift), of_two_lengths(), effects=drift)
+    lasting = [len(drive.command) for drive in log.drives]
+    assert [piece.windows.steps for piece in log.pieces] == lasting and lasting[1] < 0.95 * lasting[0]
+
+
 @pytest.mark.slow
 def test_a_motion_that_is_replayed_with_another_is_as_it_is_alone(space: Space):
     logs = of_two_lengths()
