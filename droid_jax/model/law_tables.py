@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.scene import Scene
-from droid_jax.model.table_grid import ROUNDING, GridAxis, error, first_nodes, on_grid, refined
+from droid_jax.model.table_grid import ROUNDING, GridAxis, differences, first_nodes, on_grid, refined
 
 SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
 LOAD = 2000.0  # N m: likewise, where no force limit says it; nodes are closer about zero, so that far costs nothing
@@ -28,6 +28,7 @@ RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at 
 FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
 COARSEST = 0.1  # of a table's largest value, by which it may miss its law at the fitted values
+MOSTLY = 0.95  # of its cells, in which that counts: a law may jump in one
 NARROW = 1e-3  # of the probed range: as many states again lie closer and closer, for laws that act in little of it
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
@@ -290,15 +291,15 @@ class _Law:
         tables = tuple((n, on_grid(every, f)) for n, f in functions)
         sizes = [abs(values[n]) if n else 1.0 for n, _ in functions]
         pairs = list(zip(tables, functions, strict=True))
-        worst = float(np.dot(sizes, [error(every, f, t) for (_, t), (_, f) in pairs]))
+        worst = float(np.dot(sizes, [differences(every, f, t).max() for (_, t), (_, f) in pairs]))
         here = tuple(int(np.abs(a.nodes - v).argmin()) for a, v in zip(every, fitted, strict=False))
         fixed = [
             *(replace(a, nodes=a.nodes[i : i + 1]) for a, i in zip(every, here, strict=False)),
             *every[len(here) :],
         ]
-        at_fitted = [error(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
-        own = float(np.dot(sizes, at_fitted))
-        if own > COARSEST * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
+        off = [differences(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
+        own, usual = (float(np.dot(sizes, [np.quantile(each, q) for each in off])) for q in (1.0, MOSTLY))
+        if usual > COARSEST * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
             return self.without(f"a table of {len(every[-1].nodes)} nodes is too coarse for it")
         effect = self.effect
         return LawTable(

@@ -82,8 +82,8 @@ def on_grid(axes: Sequence[GridAxis], function: Function) -> np.ndarray:
     return function(grid).reshape([len(a.nodes) for a in axes])
 
 
-def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> float:
-    """Largest difference between a table and its function, at points in random cells."""
+def differences(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> np.ndarray:
+    """[points] difference between a table and its function, at points in random cells."""
     rng, x = np.random.default_rng(0), np.empty((points, len(axes)))
     for i, axis in enumerate(axes):
         cell = rng.integers(max(len(axis.nodes) - 1, 1), size=points)
@@ -91,7 +91,7 @@ def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, point
         x[:, i] = axis.nodes[cell] + rng.uniform(size=points) * width[cell]
     wide = [i for i, a in enumerate(axes) if len(a.nodes) > 1]
     if not wide:
-        return float(np.abs(function(x[:1]) - table.reshape(-1)[0]).max())
+        return np.abs(function(x) - table.reshape(-1)[0])
     narrow = tuple(i for i in range(len(axes)) if i not in wide)
     inner = scipy.interpolate.RegularGridInterpolator([axes[i].nodes for i in wide], np.squeeze(table, narrow))
-    return float(np.abs(inner(x[:, wide]) - function(x)).max())
+    return np.abs(inner(x[:, wide]) - function(x))

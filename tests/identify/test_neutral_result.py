@@ -259,12 +259,16 @@ def test_a_ripple_has_a_table_where_its_periods_have_nodes(made: Made):
     table = table_of(made, "torque_ripple", ripple)
     assert isinstance(table, LawTable) and table.error < 0.03
 
-    def quick(theta: Any, state: Any) -> Any:
-        return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * jnp.sin(3000.0 * state.qpos[0]))
+    def made_of(shape: Any) -> LawTable | NoTable:
+        def force(theta: Any, state: Any) -> Any:
+            return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * shape(state.qpos[0]))
 
-    effect = Effect("quick", (Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0),), force=quick)
-    (none,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {})
+        effect = Effect("shaped", (Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0),), force=force)
+        return next(iter(law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {})))
+
+    none = made_of(lambda q: jnp.sin(3000.0 * q))
     assert isinstance(none, NoTable) and "too coarse" in none.why
+    assert isinstance(made_of(jnp.sign), LawTable)  # misses its law next to the jump alone
 
 
 GEARED = {"gear_motor[elbow]": 0.2, "gear_links[elbow]": 0.1, "gear_at_rest[elbow]": 0.0, "gear_speed": 0.7}
