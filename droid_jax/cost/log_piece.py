@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy import sparse
@@ -28,6 +28,7 @@ from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
 LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
+ALIKE = 1.01  # the same where sensors err with time, centred on the replay's clock: what is added would be an offset
 MANY = 8  # windows of a sample from which its batches always have many rows
 TRACES = ("torque", "position", "velocity", "object_angle")
 
@@ -103,11 +104,11 @@ class Piece:
         columns = 2 * dofs
         which = np.repeat(np.arange(self.count), columns)
         step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # one row for each column
-        rows = np.repeat(self.stated(values)[None], len(which), axis=0)
+        rows, own = np.repeat(self.stated(values)[None], len(which), axis=0), np.arange(len(which))
         ends = list[np.ndarray]()
         for s in (1.0, -1.0):
             start, speed = windows.start[which] + s * step[:, :dofs], windows.speed[which] + s * step[:, dofs:]
-            given = windows.table[which], start, windows.gains[which], speed, windows.begin[which]
+            given = [(windows.table, which), (start, own), (windows.gains, which), (speed, own), (windows.begin, which)]
             parts = [self.smoothed(r, which[of])["smooth"] for r, of in _blocks(self.program, rows, given, self.count)]
             ends.append(np.concatenate(parts))
         found = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
@@ -150,8 +151,8 @@ def _together(
     piece, window = np.repeat(np.arange(len(pieces)), list(map(len, chosen))), np.concatenate(chosen)
     piece, window = np.tile(piece, count), np.tile(window, count)
     first = np.cumsum([0, *(p.count for p in pieces)])[:-1]
-    names = ("table", "start", "gains", "speed", "begin")
-    given = [np.concatenate([getattr(p.windows, name) for p in pieces])[first[piece] + window] for name in names]
+    names, pick = ("table", "start", "gains", "speed", "begin"), first[piece] + window
+    given = [(np.concatenate([getattr(p.windows, name) for p in pieces]), pick) for name in names]
     parts = list[list[dict[str, np.ndarray]]]([] for _ in pieces)
     rows = np.repeat(values, each, axis=0)
     for i, one in enumerate(pieces):
@@ -170,25 +171,27 @@ def _together(
 
 
 def _blocks(
-    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[np.ndarray], each: int
+    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[tuple[np.ndarray, np.ndarray]], each: int
 ) -> Iterator[tuple[Rollout, np.ndarray]]:
     """The Rollouts of rows [R, D] and of what else a program takes, block by block, on the host, and which they are.
 
+    given: arrays, and which of their entries [R] the rows take: a table for each would not fit into memory.
     each: rows that every sample has.
     """
     size = block_size(len(values), each >= MANY)
     for first in range(0, len(values), size):
         rows = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
         count = min(size, len(values) - first)
-        rollout = program(values[rows], *(np.asarray(a[rows], np.float32) for a in given))
+        rollout = program(values[rows], *(np.asarray(a[pick[rows]], np.float32) for a, pick in given))
         yield Rollout(*(np.asarray(getattr(rollout, f.name))[:count] for f in fields(rollout))), rows[:count]
 
 
-def shared_steps(steps: Sequence[int]) -> list[int]:
+def shared_steps(steps: Sequence[int], effects: Sequence[Effect] = ()) -> list[int]:
     """How long each of some motions is replayed, at least its own steps: few different numbers."""
+    longer = ALIKE if any(e.over_time and e.observe is not None for e in effects) else LONGER
     found, longest = [0] * len(steps), 0
     for i in sorted(range(len(steps)), key=lambda i: -steps[i]):
-        longest = longest if steps[i] <= longest <= LONGER * steps[i] else steps[i]
+        longest = longest if steps[i] <= longest <= longer * steps[i] else steps[i]
         found[i] = longest
     return found
 
@@ -206,6 +209,8 @@ def in_windows(
     number: int = 0,
 ) -> Piece | None:
     """A repeat in windows, without those in which something was not measured; see `windowed_log`.  None: in all."""
+    if any(effect.profile is not None for effect in effects):
+        windows = replace(windows, history=max(windows.history, windows.past))
     made = cut(scene, recording, drive, repeat, windows, grid, number)
     if not len(made.begin):
         return None

@@ -269,7 +269,7 @@ def windowed_log(
         drive = followed(scene, recording, config)
         assert isinstance(drive, Drive)
         drives.append(drive)
-    lasting = shared_steps([len(drive.command) for drive in drives])
+    lasting = shared_steps([len(drive.command) for drive in drives], effects)
     made, short = list[Piece | None](), dict[str, TooShort]()
     for recording, drive, steps in zip(recordings, drives, lasting, strict=True):
         for repeat in range(recording.repeats):

@@ -19,13 +19,17 @@ import numpy as np
 
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.scene import Scene
-from droid_jax.model.table_grid import ROUNDING, GridAxis, error, first_nodes, on_grid, refined
+from droid_jax.model.table_grid import ROUNDING, GridAxis, differences, first_nodes, on_grid, refined
 
 SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
-LOAD = 20.0  # N m: likewise, where no force limit says it
+LOAD = 2000.0  # N m: likewise, where no force limit says it; nodes are closer about zero, so that far costs nothing
+USUAL_LOAD = 20.0  # N m: a torque that is rounded off about as a servo's feedback is
 RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
 FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
 PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
+COARSEST = 0.1  # of a table's largest value, by which it may miss its law at the fitted values
+MOSTLY = 0.95  # of its cells, in which that counts: a law may jump in one
+NARROW = 1e-3  # of the probed range: as many states again lie closer and closer, for laws that act in little of it
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
 
@@ -150,10 +154,14 @@ class _Law:
         command = self.effect.command
         assert command is not None
 
+        names, at = self.parameters, {n: self.values[n] for n in self.parameters}
+        none = "it does more to the command than to delay it"
+        if np.ndim(command(self.theta(at), jnp.float32(1.0), lambda t: t)):  # each actuator's by itself
+            return self.without(none)
+
         def late(given: dict[str, float], power: int) -> float:
             return float(command(self.theta(given), jnp.float32(1.0), lambda t: t**power))
 
-        names, at = self.parameters, {n: self.values[n] for n in self.parameters}
         found = [1.0 - late({**dict.fromkeys(names, 0.0), n: 1e-3}, 1) for n in names]
         whole = 1.0 - late(at, 1)
         shares = np.array(found) / 1e-3
@@ -161,7 +169,7 @@ class _Law:
             abs(float(shares @ [at[n] for n in names]) - whole) < 1e-5 and abs((1 - whole) ** 2 - late(at, 2)) < 1e-5
         )
         if not straight:
-            return self.without("it does more to the command than to delay it")
+            return self.without(none)
         terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, shares, strict=True) if s)
         return LawTable(
             self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0, 0.0
@@ -172,17 +180,21 @@ class _Law:
         scene, nv = self.scene, self.scene.model.nv
         function = self._batched(acts)
         rng = np.random.default_rng(0)
-        base = np.concatenate([np.tile(scene.model.qpos0, (PROBES, 1)), np.zeros((PROBES, 2 * nv))], axis=1)
-        base = base + rng.uniform(-0.5, 0.5, base.shape)
-        at = {n: np.full(PROBES, self.probe(n)) for n in self.parameters}
+        scale = np.concatenate([np.ones(PROBES), np.geomspace(NARROW, 1.0, PROBES)])
+        base = np.tile(np.concatenate([scene.model.qpos0, np.zeros(2 * nv)]), (len(scale), 1))
+        base = base + scale[:, None] * rng.uniform(-0.5, 0.5, base.shape)
+        at = {n: np.full(len(scale), self.probe(n)) for n in self.parameters}
         now = function(at, base)
+        if np.any(function(at, np.concatenate([base, rng.uniform(-0.5, 0.5, (len(scale), 2 * nv))], axis=1)) != now):
+            yield self.without("it depends on what motor and links put onto the gear")
+            return
         if not np.abs(now).max() > 0:
             yield self.without("it does not act near the scene's own pose, where its table would be made")
             return
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
             other = base.copy()
-            other[:, column] += rng.uniform(0.1, 0.6, PROBES) * rng.choice([-1, 1], PROBES)
+            other[:, column] += rng.uniform(0.1, 0.6, len(scale)) * rng.choice([-1, 1], len(scale))
             moved = np.abs(function(at, other) - now).max(axis=0) > CHANGE * max(np.abs(now).max(), 1e-9)
             for dof in np.flatnonzero(moved):
                 touched.setdefault(int(dof), set()).add((variable, row))
@@ -222,15 +234,19 @@ class _Law:
             return batch(given, x, np.full(len(x), q), np.full(len(x), v))
 
         reach = self._load_reach(joint)
-        probes = np.linspace(-reach, reach, 41)
-        at = {n: np.full(41, self.probe(n)) for n in self.parameters}
-        if np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)).max() > 1e-4 * reach:
+        half = reach * np.geomspace(1e-3, 1.0, 20)
+        probes = np.concatenate([-half, [0.0], half])
+        at = {n: np.full(len(probes), self.probe(n)) for n in self.parameters}
+        rounded = 1e-4 * np.maximum(np.abs(probes), min(reach, USUAL_LOAD))
+        if np.any(np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)) > rounded):
             return self.without("it depends on more than the servo's torque")
         unit = UNIT["torque"][self.scene.slides(joint)]
         return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],
                           lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
 
-    def _table(self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]) -> LawTable:
+    def _table(
+        self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]
+    ) -> LawTable | NoTable:
         scene, model = self.scene, self.scene.model
         acting, of = (model.joint(int(model.dof_jntid[d])).name for d in (dof, row))
         slides = model.jnt_type[model.dof_jntid[row]] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -246,7 +262,9 @@ class _Law:
         assert acting == of or acts == "force"
         return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
 
-    def _made(self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> LawTable:
+    def _made(
+        self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]
+    ) -> LawTable | NoTable:
         """Terms by linear coefficients; all other parameters are axes of the table."""
         names, values = self.parameters, self.values
         linear = [n for n in names if n in self.coefficients and self._linear(n, axes, at)]
@@ -273,14 +291,16 @@ class _Law:
         tables = tuple((n, on_grid(every, f)) for n, f in functions)
         sizes = [abs(values[n]) if n else 1.0 for n, _ in functions]
         pairs = list(zip(tables, functions, strict=True))
-        worst = float(np.dot(sizes, [error(every, f, t) for (_, t), (_, f) in pairs]))
+        worst = float(np.dot(sizes, [differences(every, f, t).max() for (_, t), (_, f) in pairs]))
         here = tuple(int(np.abs(a.nodes - v).argmin()) for a, v in zip(every, fitted, strict=False))
         fixed = [
             *(replace(a, nodes=a.nodes[i : i + 1]) for a, i in zip(every, here, strict=False)),
             *every[len(here) :],
         ]
-        at_fitted = [error(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
-        own = float(np.dot(sizes, at_fitted))
+        off = [differences(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
+        own, usual = (float(np.dot(sizes, [np.quantile(each, q) for each in off])) for q in (1.0, MOSTLY))
+        if usual > COARSEST * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
+            return self.without(f"a table of {len(every[-1].nodes)} nodes is too coarse for it")
         effect = self.effect
         return LawTable(
             effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst
@@ -300,12 +320,13 @@ class _Law:
         return bool(np.abs(none).max() <= slack and np.abs(two - 2 * one).max() <= slack and parts <= slack)
 
     def _batched(self, acts: str) -> Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]:
-        """(parameters [K] each, states [K, nq + nv + nv]) -> [K, nv]."""
+        """(parameters [K] each, states [K, nq + nv + nv], with the gear's torques 2 nv more) -> [K, nv]."""
         nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.model
         raised = jnp.full(nv, RAISED, jnp.float32)
 
         def one(given: dict[str, Any], row: Any) -> Any:
-            state = State(jnp.float32(0), row[:nq], row[nq : nq + nv], row[nq + nv :], model)
+            position, speed, load, gear = jnp.split(row, (nq, nq + nv, nq + 2 * nv))
+            state = State(jnp.float32(0), position, speed, load, model, gear=gear.reshape(2, nv))
             theta = self.theta(given)
             if acts == "force":
                 assert self.effect.force is not None
@@ -313,7 +334,12 @@ class _Law:
             assert self.effect.frictionloss is not None
             return self.effect.frictionloss(theta, state, raised) - raised
 
-        return _padded(one)
+        batch, wide = _padded(one), nq + 4 * nv
+
+        def of(given: dict[str, np.ndarray], states: np.ndarray) -> np.ndarray:
+            return batch(given, np.pad(states, ((0, 0), (0, wide - states.shape[1]))))
+
+        return of
 
     def _columns(self) -> Iterator[tuple[int, str, int]]:
         """(column of a state, variable, degree of freedom), of joints of one degree."""

@@ -58,6 +58,7 @@ class Scene:
         grip: how a lost grasp is seen, or None where there is nothing to grip.
         path: of the MJCF that it was loaded from, or None where it was not a file alone.
         held: joints whose dry friction holds still here, and creeps in the MJCF (`load_scene`).
+        hold: dry friction that an effect brings to a joint shall hold still too (`effects.registry.ready`).
     """
 
     name: str
@@ -69,6 +70,7 @@ class Scene:
     grip: Grip | None = None
     path: Path | None = None
     held: tuple[str, ...] = ()
+    hold: bool = False
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named thing; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
@@ -395,21 +397,21 @@ def load_scene(
         scene = compile_scene(spec, path.stem, joints=joints, object_joint=object_joint, engine=engine, mj_step=mj_step)
     except ValueError as error:
         raise ValueError(f"{path}: {said(error, LONGEST)}") from None
-    return dataclasses.replace(scene, held=held, path=None if assets else path.resolve())
+    return dataclasses.replace(scene, held=held, hold=hold, path=None if assets else path.resolve())
 
 
 def _hold(spec: mujoco.MjSpec) -> tuple[str, ...]:
     """Make the dry friction of a spec's joints hard where nothing is said of its constraint; names of these joints."""
-    soft = [
-        joint
-        for joint in spec.joints
-        if joint.frictionloss > 0
-        and np.allclose(joint.solref_friction, SOFT_REFERENCE)
-        and np.allclose(joint.solimp_friction, SOFT_IMPEDANCE)
-    ]
+    soft = [joint for joint in spec.joints if joint.frictionloss > 0 and is_soft(joint)]
     for joint in soft:
         joint.solimp_friction[:2] = HARD
     return tuple(joint.name for joint in soft if joint.name)
+
+
+def is_soft(joint: Any) -> bool:
+    """Whether nothing is said of the friction constraint of a spec's joint: it is MuJoCo's default, which creeps."""
+    default = np.allclose(joint.solref_friction, SOFT_REFERENCE)
+    return bool(default and np.allclose(joint.solimp_friction, SOFT_IMPEDANCE))
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:

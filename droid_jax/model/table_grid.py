@@ -13,7 +13,8 @@ Function = Callable[[np.ndarray], np.ndarray]  # [K, axes] -> [K]
 FINE, COARSE = 1e-3, 5e-3  # of the function: error between nodes of variables, and of parameters
 SMALL = 0.02  # of its largest value: what is smaller counts as this
 ROUNDING = 1e-5  # what float32 leaves of a friction
-MOST, MOST_SHAPES = 300, 17  # nodes of a variable, of a parameter
+MOST, MOST_BESIDE, MOST_SHAPES = 2500, 300, 17  # nodes of a variable, of one beside another, of a parameter
+WITHIN = (0.5, 0.3)  # of the way to the next node, where lines are compared: the middle alone may be a ripple's zero
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,9 @@ def refined(axes: Sequence[GridAxis], functions: Sequence[Function], fitted: Seq
     fitted: values of the parameters, which are the first axes; variables are refined at these.
     """
     out, shapes = list(axes), len(fitted)
+    variable = MOST if len(axes) - shapes == 1 else MOST_BESIDE
     for k in (*range(shapes, len(axes)), *range(shapes)):
-        most, slack = (MOST_SHAPES, COARSE) if k < shapes else (MOST, FINE)
+        most, slack = (MOST_SHAPES, COARSE) if k < shapes else (variable, FINE)
         others = [
             np.array([fitted[i]]) if i < shapes <= k else axis.nodes[:: max(1, len(axis.nodes) // 30)]
             for i, axis in enumerate(out)
@@ -59,10 +61,13 @@ def _split(nodes: np.ndarray, along: Function, most: int, slack: float) -> np.nd
     """Nodes and middles between them, until no line misses by more than a share of what is there."""
     largest = float(np.abs(along(nodes)).max())
     while 1 < len(nodes) < most:
-        middle, at = 0.5 * (nodes[1:] + nodes[:-1]), along(nodes)
-        there = along(middle)
-        allowed = slack * (np.abs(there) + SMALL * largest) + ROUNDING
-        missed = (np.abs(there - 0.5 * (at[1:] + at[:-1])) / allowed).max(axis=1)
+        at, missed = along(nodes), np.zeros(len(nodes) - 1)
+        for share in WITHIN:
+            there = along((1.0 - share) * nodes[:-1] + share * nodes[1:])
+            allowed = slack * (np.abs(there) + SMALL * largest) + ROUNDING
+            line = (1.0 - share) * at[:-1] + share * at[1:]
+            missed = np.maximum(missed, (np.abs(there - line) / allowed).max(axis=1))
+        middle = 0.5 * (nodes[1:] + nodes[:-1])
         bad = np.flatnonzero((missed > 1.0) & (np.diff(nodes) > 1e-7 * np.ptp(nodes)))
         if not bad.size:
             break
@@ -77,8 +82,8 @@ def on_grid(axes: Sequence[GridAxis], function: Function) -> np.ndarray:
     return function(grid).reshape([len(a.nodes) for a in axes])
 
 
-def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> float:
-    """Largest difference between a table and its function, at points in random cells."""
+def differences(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> np.ndarray:
+    """[points] difference between a table and its function, at points in random cells."""
     rng, x = np.random.default_rng(0), np.empty((points, len(axes)))
     for i, axis in enumerate(axes):
         cell = rng.integers(max(len(axis.nodes) - 1, 1), size=points)
@@ -86,7 +91,7 @@ def error(axes: Sequence[GridAxis], function: Function, table: np.ndarray, point
         x[:, i] = axis.nodes[cell] + rng.uniform(size=points) * width[cell]
     wide = [i for i, a in enumerate(axes) if len(a.nodes) > 1]
     if not wide:
-        return float(np.abs(function(x[:1]) - table.reshape(-1)[0]).max())
+        return np.abs(function(x) - table.reshape(-1)[0])
     narrow = tuple(i for i in range(len(axes)) if i not in wide)
     inner = scipy.interpolate.RegularGridInterpolator([axes[i].nodes for i in wide], np.squeeze(table, narrow))
-    return float(np.abs(inner(x[:, wide]) - function(x)).max())
+    return np.abs(inner(x[:, wide]) - function(x))

@@ -213,20 +213,23 @@ def layout_of(space: Space) -> Layout:
 def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """The effects, and those of the torque sensors that are not among them: what a replay is made with.
 
-    Offsets always, all else where the space asks for it.
+    Offsets always, all else where the space asks for it.  Friction comes first: it is part of the torque that sensors
+    delay, scale or mix.
     """
     given = {e.name for e in effects}
     friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
-    sensed = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
-    return (*effects, *(e for e in sensed if e.name not in given))
+    felt, read = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
+    return (*(e for e in felt if e.name not in given), *effects, *(e for e in read if e.name not in given))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
-def _sensor_effects(joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool) -> tuple[Effect, ...]:
-    """The same effects each time: programs are distinguished by theirs."""
-    found = [joint_friction_effect(joints, jnp.sign if prescribed else direction)] if friction else []
-    found += [torque_gain_effect(joints)] if gain else []
-    return (*found, torque_offset_effect(joints))
+def _sensor_effects(
+    joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool
+) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
+    """What a sensor feels and what it makes of it; the same effects each time: programs are distinguished by theirs."""
+    felt = (joint_friction_effect(joints, jnp.sign if prescribed else direction),) if friction else ()
+    read = (torque_gain_effect(joints),) if gain else ()
+    return felt, (*read, torque_offset_effect(joints))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)

@@ -12,10 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_weight
+from droid_jax.model.gravity import field_force
 from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
@@ -160,13 +162,17 @@ def path_replay(
             torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias
             springs = data.qfrc_passive - compensated * data.qfrc_gravcomp
             torque = torque - springs
+            carried = jnp.zeros_like(velocity)  # weight that gears carry and the torque does not hold
+            if not convention.gravity and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+                carried = -field_force(model, data, model.body_mass, model.opt.gravity)
             if error is not None and not convention.gravity:
                 torque = torque + misplaced_weight(model, data, error)
             direction = jnp.sign(velocity)
             felt = torque + model.dof_frictionloss * direction if motor else torque
             links = springs + link_model.dof_damping * velocity - data.qfrc_bias
             motors = felt + (model.dof_damping - link_model.dof_damping) * velocity  # before the joints' damping
-            state = State(time, data.qpos, velocity, felt, model, data, jnp.stack([motors, links]))
+            gear = jnp.stack([motors + carried, links - carried])
+            state = State(time, data.qpos, velocity, felt, model, data, gear)
             behind = _behind_the_sensor(scene, theta)
             own = model.dof_frictionloss if motor else behind
             force, loss = _resistance(theta, state, own, effects)

@@ -33,6 +33,7 @@ class WindowConfig:
     length: s, of what is compared of a window.
     lead: s, replayed before that and not compared; of a motion that is replayed whole its beginning.
     history: s, of commands before the lead-in; the longest delay that it can know.
+    past: s, the same where servos draw paths of their own to their goals (`Effect.profile`), which may lag for longer.
     reach: s, to both sides of its beginning, of the measured positions that tell where and how fast it begins.
     every: s, in each of which one window lies, at a place that differs; None: none is left out.
     longest: s, of motions that are replayed whole where a servo holds every joint, in all.  Of more of them
@@ -43,6 +44,7 @@ class WindowConfig:
     length: float = 0.5
     lead: float = 0.2
     history: float = 0.15
+    past: float = 2.0
     reach: float = 0.06
     every: float | None = None
     longest: float = 120.0
@@ -55,7 +57,7 @@ class WindowConfig:
         check_fields(
             self,
             **dict.fromkeys(("length", "reach", "longest", "sample_length"), above),
-            **dict.fromkeys(("lead", "history", "sample_lead"), least),
+            **dict.fromkeys(("lead", "history", "past", "sample_lead"), least),
             every=optional(above),
             samples=partial(whole, least=1),
         )

@@ -61,11 +61,12 @@ def hide_encoder_zero(place: Place, a: float) -> Influence:
     feedback = np.where(gain != 0, -model.actuator_biasprm[place.actuators, 1] / np.where(gain != 0, gain, 1.0), 0.0)
     ahead = feedback * model.actuator_gear[place.actuators, 0]  # 1 of a position servo, 0 of a motor
 
-    def compensation(live: Live, positions: np.ndarray) -> np.ndarray:
+    def compensation(positions: np.ndarray) -> np.ndarray:
+        """By the model that the controller has, whatever other effects made of the robot's own."""
         read.qpos[:] = positions
-        mujoco.mj_kinematics(live.model, read)
-        mujoco.mj_comPos(live.model, read)
-        mujoco.mj_passive(live.model, read)
+        mujoco.mj_kinematics(model, read)
+        mujoco.mj_comPos(model, read)
+        mujoco.mj_passive(model, read)
         return read.qfrc_gravcomp.copy()
 
     def command(clock: np.ndarray, control: np.ndarray) -> np.ndarray:
@@ -77,10 +78,10 @@ def hide_encoder_zero(place: Place, a: float) -> Influence:
         live.position[place.qpos] += a
 
     def step(live: Live) -> None:
-        if a != 0.0 and live.model.body_gravcomp.any():
+        if a != 0.0 and model.body_gravcomp.any():
             seen = live.position.copy()
             seen[place.qpos] -= a
-            live.applied[:] += compensation(live, seen) - compensation(live, live.position)
+            live.applied[:] += compensation(seen) - compensation(live.position)
 
     def sense(seen: Seen) -> Seen:
         position = seen.position.copy()

@@ -142,7 +142,7 @@ def hide_firm_friction(place: Place, a: float) -> Influence:
         v = live.velocity[place.dofs]
         end = level * np.sign(v)
         force[:] = end + (force - end) * np.exp(-np.abs(v) * live.timestep / FIRM_REACH)
-        live.loss[place.dofs] *= 1.0 - a
+        live.loss[place.dofs] -= level
         live.applied[place.dofs] -= force + damper * v * np.exp(-((v / FIRM_SPEED) ** 2))
 
     return Influence(begin=begin, step=step)

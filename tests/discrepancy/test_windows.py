@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pendulum as made
 import pytest
@@ -22,12 +23,12 @@ from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
-from droid_jax.discrepancy.candidates import observable_effects
+from droid_jax.discrepancy.candidates import SMALL, observable_effects
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.model.effects.registry import library
+from droid_jax.model.effects.registry import joined, library
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
@@ -245,6 +246,24 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
 
 
+def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
+    """A goal that may move by 0.7 rad/s lags for longer than delays do: it began at rest on the last goals alone.
+
+    The size is that of the score test, at which slow commands must be limited.
+    """
+    effects = library(scene(), ["profile_speed"])
+    whole, theta = joined(space, effects), {"profile_speed[swing]": SMALL * effects[0].parameters[0].std}
+    assert effects[0].profile is not None and theta["profile_speed[swing]"] == pytest.approx(1.5)
+    log = log_of(whole, [swung("a", 1.0, 0.7)], effects=effects)
+    windows, command = log.pieces[0].windows, log.drives[0].command
+    path = np.asarray(effects[0].profile(theta, jnp.asarray(command), 0.004))
+    assert np.abs(path - command).max() > 0.2
+    for begin, table in zip(windows.begin, windows.table, strict=True):
+        first = round(begin / 0.004)
+        drawn = effects[0].profile(theta, jnp.asarray(table), 0.004)[windows.earlier :]
+        np.testing.assert_allclose(drawn, path[first : first + windows.steps], atol=1e-4)
+
+
 @pytest.mark.slow
 def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
     """Which make blocks, as windows do."""
@@ -270,6 +289,14 @@ def test_motions_of_about_one_length_are_replayed_together(space: Space):
     assert shared_steps([400, 100, 380, 390]) == [400, 100, 400, 400] and shared_steps([7]) == [7]
     both = whole_log(space, of_two_lengths())
     assert both.pieces[0].program is both.pieces[1].program
+
+
+def test_a_drift_is_centred_on_the_motion_itself(space: Space):
+    """Not on the longer one of which it shares a program, or it would be an offset besides."""
+    drift = library(scene(), ["torque_drift"])
+    log = whole_log(joined(space, drift), of_two_lengths(), effects=drift)
+    lasting = [len(drive.command) for drive in log.drives]
+    assert [piece.windows.steps for piece in log.pieces] == lasting and lasting[1] < 0.95 * lasting[0]
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from droid_jax.identify.neutral_result import with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.effects.registry import effect_space, joined, library, ready
 from droid_jax.model.fields import joint_damping
-from droid_jax.model.law_tables import NoTable, law_tables
+from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
@@ -224,6 +224,67 @@ def test_a_law_that_has_no_table_is_named_and_nothing_is_lost(made: Made):
         effect = Effect("own", (parameter,), force=force, locations={"elbow": ("size",)})
         (found,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {"size": 0.1})
         assert isinstance(found, NoTable) and said in found.why
+
+
+def table_of(made: Made, name: str, values: dict[str, float]) -> LawTable | NoTable:
+    """Of an effect of the library at one joint, at values that are known."""
+    found = list(law_tables(made.scene, made.scene.mjx, library(made.scene, [name]), values, {}))
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_law_of_load_goes_as_far_as_loads_do(made: Made):
+    """Where no force limit says how far; it stopped at 20 N m without a word."""
+    table = table_of(made, "load_friction", {"load_friction[elbow]": 0.1})
+    assert isinstance(table, LawTable) and table.axes[0].name == "load" and table.error < 1e-3
+    np.testing.assert_allclose(np.interp([0.05, 300.0], table.axes[0].nodes, table.terms[0][1]), [0.05, 300.0])
+
+
+STRIBECK = {"joint_stribeck[shoulder]": 0.2, "joint_stribeck_speed": 0.005, "joint_stribeck_exponent": 2.0}
+LATCH = {"latch_torque": 0.2, "latch_width": 0.01, "latch_exponent": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "variable"), [("joint_stribeck", STRIBECK, "speed"), ("latch", LATCH, "position")]
+)
+def test_a_law_that_acts_in_a_narrow_range_has_a_table(made: Made, name: str, values: dict[str, float], variable: str):
+    """Friction within some mrad/s, a latch within a hundredth of a radian: no probe came so near."""
+    table = table_of(made, name, values)
+    assert isinstance(table, LawTable) and table.axes[-1].name == variable
+
+
+def test_a_ripple_has_a_table_where_its_periods_have_nodes(made: Made):
+    """Two nodes a period were nothing like it, and nothing said so; at all of them a ripple may be zero, too."""
+    ripple = {"ripple_sine[elbow]": 0.3, "ripple_periods": 64.0}
+    table = table_of(made, "torque_ripple", ripple)
+    assert isinstance(table, LawTable) and table.error < 0.03
+
+    def made_of(shape: Any) -> LawTable | NoTable:
+        def force(theta: Any, state: Any) -> Any:
+            return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * shape(state.qpos[0]))
+
+        effect = Effect("shaped", (Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0),), force=force)
+        return next(iter(law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {})))
+
+    none = made_of(lambda q: jnp.sin(3000.0 * q))
+    assert isinstance(none, NoTable) and "too coarse" in none.why
+    assert isinstance(made_of(jnp.sign), LawTable)  # misses its law next to the jump alone
+
+
+GEARED = {"gear_motor[elbow]": 0.2, "gear_links[elbow]": 0.1, "gear_at_rest[elbow]": 0.0, "gear_speed": 0.7}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("velocity_feedforward", {"velocity_feedforward[elbow]": 0.02}, "more to the command than to delay it"),
+        ("gear_friction", GEARED, "what motor and links put onto the gear"),
+    ],
+)
+def test_why_a_law_has_no_table_is_said_in_words(made: Made, name: str, values: dict[str, float], why: str):
+    """Not as the error of a program that took a row for a number, or nothing for a gear."""
+    none = table_of(made, name, values)
+    assert isinstance(none, NoTable) and why in none.why
 
 
 def test_commands_come_late(made: Made):

@@ -14,15 +14,17 @@ from two_link import MOTOR, arm, motion, recording
 
 from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.door.space import torque_offsets
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import joint_damping
+from droid_jax.model.joint_friction import joint_friction_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate import compiled
 from droid_jax.simulate.batching import time_loop
-from droid_jax.simulate.replay import make_drive, servo_replay
+from droid_jax.simulate.replay import TORQUE_OFFSETS, make_drive, sensed, servo_replay
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +121,18 @@ def summed(traced: list[int]) -> Any:
 
 
 RATES = jnp.array([1.0, -0.5, 3.0])
+
+
+def test_sensors_see_the_friction_behind_them_before_they_err(scene: Scene):
+    """Coulomb friction is part of the torque that another gain scales and neighbours read: it was added afterwards."""
+    effects, base = library(scene, ["torque_crosstalk"]), joint_friction_space(scene.joints)
+    made_with = compiled.with_sensors(scene, base, make_drive(scene, recording()), effects)
+    assert {e.name for e in made_with} == {"joint friction", "torque_crosstalk", TORQUE_OFFSETS}
+    theta = {"coulomb[shoulder]": 2.0, "crosstalk_before[elbow]": 0.25, "torque_offset[shoulder]": 8.0}
+    still = jnp.zeros((5, 2))
+    motion = Rollout(still[:, 0], still, still, still + 1.0, still[:, 0], still[:, :0], jnp.array(True))
+    seen = sensed(motion, {n: jnp.float32(v) for n, v in theta.items()}, made_with, 0.002)
+    np.testing.assert_allclose(seen.torque, np.tile([10.0, 0.5], (5, 1)))
 
 
 def test_a_batch_is_its_rows_and_traces_a_step_twice():

@@ -20,9 +20,11 @@ from droid_jax.identify.holdout import split_repeats
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import body_mass, joint_damping, joint_encoder_offset, joint_frictionloss
 from droid_jax.model.joint_friction import sensor_parameter
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics
+from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.model.step import gear_torques
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.compiled import compiled_replay
 from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed
@@ -183,6 +185,33 @@ def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
         np.testing.assert_allclose(other.torques(paths), np.stack([mjx.torque[0]] * 2), atol=5e-5)  # at the means
         if side is LINK:  # MJX compiles them again
             np.testing.assert_allclose(other.torques(paths), one.torques(paths), atol=5e-5)
+
+
+@pytest.mark.parametrize("gravcomp", [True, False])
+def test_gears_carry_the_weight_that_a_torque_does_not_hold(gravcomp: bool):
+    """What motor and links put onto a gear is what a servo's replay has at the same moment, whatever the log is of.
+
+    Along a motion whose torque holds no weight, gears carried none.
+    """
+    scene = planar(gravcomp=gravcomp)
+    data, rng = mujoco.MjData(scene.model), np.random.default_rng(4)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = rng.normal(0.0, 0.5, (3, 2))
+    mujoco.mj_forward(scene.model, data)
+    servo = np.array(gear_torques(scene.mjx, mjx.put_data(scene.model, data), jnp.asarray(data.qvel)))
+    moment = (data.qpos, data.qvel, data.qacc)
+    given = motion(scene, MOTOR, gravity=False, count=1)
+    given = replace(
+        given, **dict(zip(("position", "velocity", "acceleration"), (m[None] for m in moment), strict=True))
+    )
+    space = Space(tuple(Parameter(name, "-", 0.0, 1.0, -1.0, 1.0) for name in ("motor", "links")))
+    pushed = Effect(
+        "pushed", force=lambda theta, state: -theta["motor"] * state.gear[0] - theta["links"] * state.gear[1]
+    )
+    replay = inverse_replay(scene, given, [pushed])
+    torque = jax.jit(jax.vmap(lambda v: replay(make_physics(scene, space, v)).torque[0]))(jnp.eye(3, 2, -1))
+    found = torque[1:] - torque[0]
+    np.testing.assert_allclose(found, servo, atol=1e-4)
+    assert np.abs(servo[1]).max() > 1.0
 
 
 def test_plain_c_refuses_what_it_does_not_have():

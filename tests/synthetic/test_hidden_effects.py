@@ -593,6 +593,18 @@ def test_an_encoders_zero_shifts_where_the_joint_stands_and_what_holds_its_weigh
     assert recording.channel("position").values[0, 0, 2] == pytest.approx(0.3, abs=1e-6)
 
 
+@pytest.mark.parametrize("other", ["tilted_base", "payload"])
+def test_an_encoders_zero_misplaces_the_compensation_beside_other_effects(scene: Scene, other: str):
+    """As alone: these compensate by themselves, and take the model's compensation away."""
+    scene, state = compensated(scene, 1.0), ((0.0, 0.9, 0.3), (0.0, 0.0, 0.0))
+    off = made(scene, "encoder_zero", 0.05, ["elbow"])
+    (alone, *_), first = stepped(off, live_at(scene, *state)), made(scene, other, 0.03)
+    live = live_at(scene, *state)
+    first.edit(live.model)  # type: ignore[misc]
+    np.testing.assert_allclose(stepped(off, live)[0], alone, atol=1e-12)
+    assert np.abs(alone).max() > 0.01
+
+
 def test_firm_friction_holds_what_mujocos_lets_creep():
     """0.2 of 0.3 N m at an inertia of 0.03 kg m2: 7 mrad/s in MuJoCo; where it is firm it bends, and stands."""
     mjcf = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" armature="0.03" frictionloss="0.3"/>
@@ -615,6 +627,17 @@ def test_firm_friction_holds_what_mujocos_lets_creep():
     assert 0.0 < half[-1] - half[500] < 0.6 * creep
     with pytest.raises(ValueError, match="at most 1"):
         path(1.5)
+
+
+def test_firm_friction_leaves_what_other_effects_add(scene: Scene):
+    """It is a share of the joint's own; it took that share of all that had been added before it."""
+    live, firm = live_at(scene), made(scene, "firm_friction", 0.8)
+    firm.begin(live)  # type: ignore[misc]
+    own = live.loss.copy()
+    live.loss[:] = own + 0.5
+    firm.step(live)  # type: ignore[misc]
+    np.testing.assert_allclose(live.loss, 0.2 * own + 0.5)
+    assert own.max() == pytest.approx(0.1)
 
 
 # ----- signals

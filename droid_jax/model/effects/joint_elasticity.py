@@ -87,7 +87,10 @@ def _servos(scene: Scene) -> _Servos | None:
 
 @register
 def joint_compliance(scene: Scene) -> Effect | None:
-    """Motor ahead of the link by tau c, c = 1 / stiffness, rad/(N m)."""
+    """Motor ahead of the link by tau c, c = 1 / stiffness, rad/(N m).
+
+    What shows is c beside the servo's own 1 / k: of a soft servo only a softer gear does.
+    """
     servos = _servos(scene)
     if servos is None:
         return None
@@ -98,11 +101,12 @@ def joint_compliance(scene: Scene) -> Effect | None:
         torque = servos.rigid_torque(state, ctrl) / yielding
         return servos.with_lead(state, ctrl, compliance * torque)
 
+    usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
+
     def parameter(joint: str, stiffness: float):
         # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
-        return a.coefficient(
-            f"{COMPLIANCE}[{joint}]", "rad/(N m)", 1e-4, max(1e-3, 0.3 / stiffness), low=-min(1e-4, 0.5 / stiffness)
-        )
+        high, low = max(1e-3, 0.3 / stiffness), -min(usual[joint], 0.5 / stiffness)
+        return a.coefficient(f"{COMPLIANCE}[{joint}]", "rad/(N m)", usual[joint], high, low=low)
 
     return Effect(
         COMPLIANCE,
@@ -112,7 +116,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         signature="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),
         locations=a.locations(servos.joints, COMPLIANCE),
-        minimum_size=2e-5,
+        minimum_size=0.2 * min(usual.values()),
     )
 
 

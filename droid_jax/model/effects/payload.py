@@ -101,11 +101,16 @@ def _felt(scene: Scene, body: int) -> np.ndarray:
 
 
 def _more_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> Parameter:
-    """Kilograms at a body's centre of mass, which nobody compensates."""
+    """Kilograms at a body's centre of mass, which nobody compensates.
+
+    Of a body that is compensated, mass and compensation go by one share of the model's mass, so that the compensated
+    weight stays: beside a fitted mass they are kilograms of the model's.
+    """
     mass = float(scene.model.body_mass[body])
     share = dict(gain=1.0 / mass, offset=1.0)
-    writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
+    writes = [write(scene, "body_mass", (body,), Mode.ADD)]
     if scene.model.body_gravcomp[body] != 0:
+        writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
         writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
     of_it: dict[str, Any] = dict(group=a.GROUP, role=role)
     return Parameter(name, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **of_it)

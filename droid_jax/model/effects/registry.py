@@ -17,7 +17,7 @@ from droid_jax.model.fields import ENCODER
 from droid_jax.model.inertia import PSEUDO_INERTIA, WEIGHTS
 from droid_jax.model.joint_friction import GAIN
 from droid_jax.model.parameters import Scaling, Space
-from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
+from droid_jax.model.scene import HARD, TINY_FRICTIONLOSS, Scene, is_soft
 
 Maker = Callable[[Scene], Effect | None]
 _MAKERS: dict[str, Maker] = {}
@@ -116,12 +116,19 @@ def checked(effect: Effect) -> Effect:
 def ready(scene: Scene) -> Scene:
     """The scene with a friction row for every joint whose friction an effect may raise; one for one scene.
 
-    MJX lays these rows out at compilation (see TINY_FRICTIONLOSS); they cost a little time each.
+    MJX lays these rows out at compilation (see TINY_FRICTIONLOSS); they cost a little time each.  Where the scene holds
+    friction (`Scene.hold`), they are as hard as those of joints with friction of their own.
     """
     model = copy.copy(scene.model)
     dofs = [scene.dof(j) for j in scene.joints]
     model.dof_frictionloss[dofs] = np.maximum(model.dof_frictionloss[dofs], TINY_FRICTIONLOSS)
-    return replace(scene, model=model)
+    rows = dict.fromkeys((*scene.joints, *([scene.object_joint] if scene.object_joint else [])))
+    soft = tuple(j for j in rows if scene.hold and is_soft(scene.spec.joint(j)))
+    spec = scene.spec.copy() if soft else scene.spec
+    for joint in soft:
+        spec.joint(joint).solimp_friction[:2] = HARD
+        model.dof_solimp[scene.dof(joint), :2] = HARD
+    return replace(scene, model=model, spec=spec, held=(*scene.held, *soft))
 
 
 def joined(base: Space, effects: Iterable[Effect]) -> Space:

@@ -72,11 +72,14 @@ class Inverse:
     @functools.cached_property
     def links(self) -> np.ndarray:
         """[T, J] N m that weight, springs and the other joints' motion put onto the gears."""
+        return -self.asked(gravity=True)
+
+    def asked(self, gravity: bool) -> np.ndarray:
+        """[T, J] N m that the links ask of undamped joints, but for their acceleration."""
         spec = mujoco.MjSpec.from_string(MECHANISM)
         for joint in spec.joints:
             joint.damping[:] = 0.0
-        still = replace(self.motion, acceleration=0.0 * self.motion.acceleration)
-        return -mj_inverse(spec, still, self.motion.torque.gravity)
+        return mj_inverse(spec, replace(self.motion, acceleration=0.0 * self.motion.acceleration), gravity)
 
     def torque(self, *rows: dict[str, float]) -> np.ndarray:
         """[P, T, J] N m"""
@@ -87,6 +90,7 @@ class Inverse:
         out = np.full(load.shape, np.nan)
         slowed = self.scene.model.dof_damping[self.scene.joint_dofs] * self.motion.velocity
         motor = load - slowed if self.side is MOTOR else load
+        motor = motor + self.asked(True) - self.asked(self.motion.torque.gravity)  # the gear carries the weight
         moments = (self.motion.position, self.motion.velocity, load, motor, self.links)
         for k, numbers in enumerate(zip(*moments, strict=True)):
             q, w, torque, motor, links = (dict(zip(JOINTS, n.tolist(), strict=True)) for n in numbers)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from effect_bench import ARM, door, mechanism
 
+from droid_jax.discrepancy.candidates import SMALL
 from droid_jax.model.effect_interface import State
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
@@ -40,6 +41,17 @@ def test_inside_the_play_there_is_no_torque_and_an_elastic_gear_gives_in_proport
     np.testing.assert_allclose(torque(play), 0.0, atol=1e-5)
     soft = compliance.servo({f"joint_compliance[{j}]": 1e-3 for j in ARM}, state, ctrl)
     np.testing.assert_allclose(torque(soft), 0.002 / (1.0 / stiffness + 1e-3), rtol=1e-4)
+
+
+def test_an_elastic_gear_is_tried_at_a_size_that_shows_beside_its_servo():
+    """A percent of a servo's stiffness or more, a soft one's too: sizes were those of servos of 500 N m/rad."""
+    scene = mechanism()
+    (effect,) = library(scene, ["joint_compliance"])
+    for parameter, joint in zip(effect.parameters, ARM, strict=True):
+        k = scene.model.actuator_gainprm[scene.command_names.index(joint), 0]
+        assert 0.01 < k * SMALL * parameter.std < 0.1
+        assert -0.5 <= k * parameter.low < 0.0 and effect.minimum_size <= 0.2 * parameter.std < parameter.high
+    assert min(k * effect.minimum_size for k in scene.model.actuator_gainprm[:, 0]) > 0.001
 
 
 # ----- axes and rotations of an arm's own kinematics against MuJoCo's

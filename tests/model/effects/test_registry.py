@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
@@ -14,10 +15,11 @@ from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects import registry
 from droid_jax.model.effects.registry import effect_space, library, ready, register, registered
-from droid_jax.model.mjcf import native
-from droid_jax.model.parameters import Parameter
-from droid_jax.model.physics import make_physics
-from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene, compile_scene
+from droid_jax.model.fields import body_mass
+from droid_jax.model.mjcf import fitted_mjcf, native
+from droid_jax.model.parameters import Parameter, Space
+from droid_jax.model.physics import make_c_model, make_physics
+from droid_jax.model.scene import HARD, TINY_FRICTIONLOSS, Scene, compile_scene, load_scene
 from droid_jax.simulate.replay import Drive, servo_replay
 
 OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge_directional", "hinge_preload",
@@ -267,6 +269,17 @@ def test_it_is_gone_afterwards():
     assert "wind" not in registered()
 
 
+def test_a_payload_is_kilograms_beside_a_fitted_mass():
+    """In MJX, in C, and in the MJCF; it was a share of the model's mass, times the fitted one."""
+    scene = edited(MECHANISM, MECHANISM.replace(' gravcomp="1"', ""))
+    (payload,) = library(scene, ["payload"])
+    space = Space((body_mass(scene, "hand", std=0.1, high=2.0),)) + effect_space([payload])
+    values, hand = space.values({"hand_mass": 0.9, "payload_mass": 0.25}), scene.id("body", "hand")
+    made = make_physics(scene, space, jnp.asarray(values, jnp.float32)).model, make_c_model(scene, space, values)
+    written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, values, [payload]))
+    np.testing.assert_allclose([model.body_mass[hand] for model in (*made, written)], 1.15, rtol=1e-6)
+
+
 # ----- rows of friction
 
 
@@ -278,3 +291,17 @@ def test_a_ready_scene_has_a_friction_row_for_every_joint():
     assert losses.min() == 0.0
     np.testing.assert_array_equal(made.model.dof_frictionloss, np.maximum(losses, TINY_FRICTIONLOSS))
     assert made.joints == bare.joints and made.object_joint == "door"
+
+
+def test_friction_that_an_effect_brings_holds_where_the_scene_holds_friction(tmp_path: Path):
+    """Of joints and of the object, whose MJCF has none: it crept, since only friction of the MJCF was made hard."""
+    path = tmp_path / "mechanism.xml"
+    path.write_text(MECHANISM.replace(' frictionloss="0.2"', ""))
+    given, held = (ready(load_scene(path, joints=ARM, object_joint="door", hold=h)) for h in (False, True))
+    dofs = [held.dof(j) for j in JOINTS]
+    np.testing.assert_array_equal(held.model.dof_solimp[dofs, :2], HARD)
+    assert set(held.held) == {*JOINTS} and given.held == ()
+    assert given.model.dof_solimp[given.dof("door"), 0] == 0.9
+    again = ready(held)
+    assert again.held == held.held and again.spec is held.spec
+    assert held.spec.joint("door").solimp_friction[0] == HARD  # of which the fitted MJCF is written
