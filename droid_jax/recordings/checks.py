@@ -280,9 +280,10 @@ def _check_phases(recording: Recording, where: str) -> None:
 
 
 def _check_gains(gains: ServoGains, names: Sequence[str], where: str) -> None:
-    for what, array in (("stiffness", gains.stiffness), ("damping", gains.damping)):
-        if array is None and what == "damping":
-            continue
+    stated: dict[str, Any] = {"stiffness": gains.stiffness}
+    if gains.damping is not None:
+        stated["damping"] = gains.damping
+    for what, array in stated.items():
         _check_array(array, (len(names),), "f", f"{where}, gains", f"{what} (one number per command joint)")
         bad = np.flatnonzero(~(np.isfinite(array) & (array >= 0)))
         if bad.size:

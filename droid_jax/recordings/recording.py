@@ -323,7 +323,7 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
     """What the hash covers: a JSON head, and little-endian arrays in a fixed order."""
     pose, gains = recording.object_pose, recording.gains
     names = sorted(recording.channels)
-    head = {
+    head: dict[str, Any] = {
         "format": "droid_jax recording 1",
         "command": [list(recording.command.shape), list(recording.command_names)],
         "channels": [

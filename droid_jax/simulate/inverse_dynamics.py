@@ -70,7 +70,7 @@ def prescribed(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tu
             "measured joints: they are taken to stand still as in the scene (state where in qpos0)",
             stacklevel=3,
         )
-    seen = dict(zip(channel.columns, channel.mask.any(axis=(0, 1)), strict=True))
+    seen = dict(zip(channel.columns, np.any(channel.mask, axis=(0, 1)).tolist(), strict=True))
     partly = [j for j in scene.single_joints if seen.get(j) and j not in (*joints, *still)]
     if partly:
         warnings.warn(

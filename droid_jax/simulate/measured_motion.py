@@ -129,7 +129,8 @@ def measured_motion(
 def measured_throughout(channel: Channel, cutoff: float = CUTOFF) -> tuple[str, ...]:
     """Columns of positions whose every sample some repeat holds, short gaps bridged as `measured_motion` does."""
     _, mask = _bridged(channel.time, channel.values, channel.mask, cutoff)
-    return tuple(c for c, whole in zip(channel.columns, mask.any(axis=0).all(axis=0), strict=True) if whole)
+    throughout: np.ndarray = np.asarray(mask.any(axis=0).all(axis=0))
+    return tuple(c for c, held in zip(channel.columns, throughout, strict=True) if held)
 
 
 def _longest(time: np.ndarray, cutoff: float) -> float:

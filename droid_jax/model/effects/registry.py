@@ -122,7 +122,7 @@ def ready(scene: Scene) -> Scene:
     model = copy.copy(scene.model)
     dofs = [scene.dof(j) for j in scene.joints]
     model.dof_frictionloss[dofs] = np.maximum(model.dof_frictionloss[dofs], TINY_FRICTIONLOSS)
-    rows = dict.fromkeys((*scene.joints, *([scene.object_joint] if scene.object_joint else [])))
+    rows: list[str] = list(dict.fromkeys((*scene.joints, *([scene.object_joint] if scene.object_joint else []))))
     soft = tuple(j for j in rows if scene.hold and is_soft(scene.spec.joint(j)))
     spec = scene.spec.copy() if soft else scene.spec
     for joint in soft:
