@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
 import scipy.stats
@@ -298,10 +299,10 @@ class Leftover:
             out.append(np.maximum.accumulate(np.sqrt(np.maximum(squares, 0.0))))
         return sizes, *out
 
-    def size_of(self, norm: np.ndarray, validation: bool = False) -> np.ndarray:
+    def size_of(self, norm: np.ndarray, part: Literal["train", "validation", "both"] = "train") -> np.ndarray:
         """Sizes from which so much is left; inf where none within the effect's bounds leaves it."""
-        sizes, *both = self.norms
-        known = both[int(validation)]
+        sizes, train, validation = self.norms
+        known = {"train": train, "validation": validation, "both": np.hypot(train, validation)}[part]
         return np.where(norm <= known[-1], np.interp(norm, known, sizes), np.inf)
 
 

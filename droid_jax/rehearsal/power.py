@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.stats
@@ -51,6 +52,7 @@ def smallest_sizes(
     """
     search = search or DiscrepancyConfig()
     units = model.repeats**0.5 if model.repeated else 1.0
+    gate = "train" if model.repeated else "both"  # blocks that train and validate are tested together
     left = [leftover(model, k) for k in wanted]
     about = np.array([_about(of, units) for of in left])
     rows = [of.at(size) for of, size in zip(left, about, strict=True)]
@@ -63,8 +65,8 @@ def smallest_sizes(
         often = max(float(scipy.stats.norm.ppf(config.share)), 0.0)
         surely = float(scipy.stats.norm.ppf(0.5 * (1 + search.selection.interval_level)))
         drawn = {
-            "score test": of.size_of(scores.crossings(i, search.selection.significance) / units),
-            "validation": of.size_of(gain_crossings(model, i, rows[i][1], config, search), validation=True),
+            "score test": of.size_of(scores.crossings(i, search.selection.significance) / units, gate),
+            "validation": of.size_of(gain_crossings(model, i, rows[i][1], config, search), "validation"),
             "time step": discrepancy_crossings(model, k, of, config),
         }
         fixed = {
@@ -112,13 +114,16 @@ def discrepancy_crossings(model: LinearModel, k: int, of: Leftover, config: Rehe
     if not model.repeated:
         return np.zeros(config.draws)
     rng, step_error, out = np.random.default_rng([config.seed, 3, k]), model.step_error, np.zeros(config.draws)
-    parts = (model.train, WORST, model.repeats, False), (model.validation, 1.0, model.judging_repeats, True)
-    for part, factor, count, validation in parts:
-        residuals = float(part.rows.counted.sum())
+    parts: tuple[tuple[Literal["train", "validation"], float, float], ...] = (
+        ("train", WORST, model.repeats),
+        ("validation", 1.0, model.judging_repeats),
+    )
+    for part, factor, count in parts:
+        residuals = float((model.train if part == "train" else model.validation).rows.counted.sum())
         along, beside = rng.normal(size=(2, config.draws))
         least = count * residuals * factor * step_error - np.sqrt(2 * residuals) * beside
         needed = np.sqrt(np.maximum(along**2 + least, 0.0)) - along
-        out = np.maximum(out, of.size_of(np.maximum(needed, 0.0) / count**0.5, validation))
+        out = np.maximum(out, of.size_of(np.maximum(needed, 0.0) / count**0.5, part))
     return out
 
 

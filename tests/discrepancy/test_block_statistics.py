@@ -14,6 +14,7 @@ from droid_jax.discrepancy.statistics import (
     Blocks,
     block_length,
     fewest_blocks,
+    in_turns,
     interleaved,
     resample_weights,
 )
@@ -32,6 +33,18 @@ def test_parts_take_turns():
         for block in range(10):
             at = np.flatnonzero(part == block)
             assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * DEFAULT_NOISE.rate - 1
+
+
+def test_the_blocks_of_both_parts_are_numbered_as_they_come():
+    clock = coarse_clock(0.0, 30.0)
+    train, validation = interleaved(clock, 0.0, 20.0, 1.0, 2)
+    both = in_turns([train, validation])
+    assert np.all((both == OUTSIDE) == (clock >= 20.0)) and np.all(np.diff(both[both != OUTSIDE]) >= 0)
+    for part in (train, validation):
+        assert len({*both[part != OUTSIDE].tolist()}) == 10
+        for block in range(10):
+            assert len({*both[part == block].tolist()}) == 1
+    assert both.max() == 19
 
 
 @pytest.mark.parametrize(("share", "needed"), [(1.0, 32.0), (2 / 3, 48.0)])

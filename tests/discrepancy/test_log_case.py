@@ -42,10 +42,15 @@ def test_dry_friction_is_found_in_one_log(log: LoneLog):
     train, validation = case.train.resampling, case.validation.resampling
     assert isinstance(train, Blocks) and isinstance(validation, Blocks)
     assert train.units == validation.units >= 8 and not np.any(train.counted & validation.counted)
+    assert case.both is not None and isinstance(both := case.both.resampling, Blocks)
+    assert both.units == 2 * train.units and np.array_equal(both.counted, train.counted | validation.counted)
     assert case.train.equivalence_factor == CONFIG.blocks.equivalence_factor
     assert case.train.prior_slack == CONFIG.blocks.prior_slack
-    verdict = search_effects(case, base_model(case), 0.0)
+    model = base_model(case)
+    verdict = search_effects(case, model, 0.0)
     assert verdict.conclusion is Conclusion.NAMED and verdict.effects == (EffectKey("joint_coulomb", "elbow"),)
+    asked = directions_of(candidates(effects))
+    assert verdict.score_tests[0].p == score_test(case.both, at_values(case.both, model), asked, CONFIG.seed).p
     at = case.full_space.index("joint_coulomb[elbow]")
     assert verdict.model.values[at] == pytest.approx(COULOMB, rel=0.1)
     before, after = verdict.discrepancies["test"]

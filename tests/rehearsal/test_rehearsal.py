@@ -181,7 +181,7 @@ def test_a_parameter_absorbs_an_effect_only_as_far_as_its_bounds():
         fit = lsq_linear(columns, target, bounds=(-3.0, 3.0)).x
         left = size * raw[0] - part.base @ fit
         assert np.linalg.norm(of.at(size)[1] - left) < 1e-3 * np.linalg.norm(left)
-        assert of.size_of(np.array([np.linalg.norm(left)]), validation=True)[0] == pytest.approx(size, rel=0.02)
+        assert of.size_of(np.array([np.linalg.norm(left)]), "validation")[0] == pytest.approx(size, rel=0.02)
     unbounded = of_repeats(train=part, validation=part)
     (loose,), (tight,) = (smallest_sizes(m, [0], CONFIG) for m in (unbounded, near))
     assert tight.size < 0.8 * loose.size
