@@ -5,13 +5,15 @@
 
 The measured motion is replayed in inverse mode through the bare arm (link side, gravity in) and viscous
 damping, Coulomb friction and offset of every joint are identified as observation parameters of the
-link-side torque, by CMA-ES and Gauss-Newton, on the first two thirds; the last third judges.  Three
-models are fitted and all three are reported:
+link-side torque, by CMA-ES and Gauss-Newton, on the first two thirds; the last third judges.  Four
+models are fitted, and all are reported:
 
 - friction: the three terms and nothing else.
 - inertia:  and a term proportional to acceleration.  In theory a rotor's inertia lies in front of the
   link-side sensor and this is zero; what comes out says how wrong the link inertias are.
 - links:    friction, with link masses (3 %) and centres of mass (5 mm) as nuisances, marginalised.
+- bodies:   friction, with each link's whole inertia as ten numbers that are a possible body at every value
+  (`model/inertia.py`), marginalised; draws of its Gaussian are checked in compiled models.
 
 `links` leads, as nuisances are on everywhere in this program but in the paper's preset: gravity
 torques of 20 N m that are 2 % off are as large as the friction looked for.
@@ -70,8 +72,10 @@ from droid_jax.door.scene import ARM, panda_arm_scene
 from droid_jax.identify.search import CmaConfig
 from droid_jax.model.effect_interface import Effect, Rollout, Theta
 from droid_jax.model.fields import body_mass_scale, model_parameter
+from droid_jax.model.inertia import inertia_parameters
 from droid_jax.model.joint_friction import SMOOTHING, joint_friction_space
 from droid_jax.model.parameters import Mode, Parameter, Space
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
@@ -85,12 +89,14 @@ SOURCE = (
     "matlab/data/Exciting_Traj/Trajectory_1, converted to npz."
 )
 LINKS = tuple(f"link{i}" for i in range(1, 8))
-MODELS = ("friction", "inertia", "links")
+MODELS = ("friction", "inertia", "links", "bodies")
 LEADING = "links"
 MOTION_CUTOFF = 8.0  # Hz
 LOG_RATE = 1000.0  # Hz
 SHARE = 2 / 3  # of the log that is fitted
 BLOCK = 2.5  # s, contiguous blocks behind the intervals
+BODY_STD = 0.05  # prior of each of the ten numbers of a link's inertia
+DRAWS = 500  # of the Gaussian, whose bodies are checked
 SCALE_STD, COM_STD, COM_LIMIT = 0.03, 0.005, 0.05  # prior of a link's mass (-) and centre of mass (m)
 OTHER_COM_STD = (0.002, 0.010)  # m, to see how much hangs on that prior
 CLOSE = 0.4  # of the published values
@@ -173,12 +179,31 @@ def link_nuisances(scene: Scene) -> Space:
     return Space((*masses, *centres))
 
 
+def link_bodies(scene: Scene) -> Space:
+    """The whole inertia of every link."""
+    each = (inertia_parameters(scene, link, std=BODY_STD, nuisance=True, group="Nuisance") for link in LINKS)
+    return Space(tuple(p for parameters in each for p in parameters))
+
+
+def possible_bodies(scene: Scene, found: Estimate, seed: int) -> dict[str, Any]:
+    """Draws of the Gaussian as models of the C engine: how many have seven bodies that can be."""
+    rows = [scene.id("body", link) for link in LINKS]
+    possible = 0
+    for values in found.gaussian.sample(seed, DRAWS):
+        model = make_c_model(scene, found.space, values)
+        moments = np.sort(model.body_inertia[rows], axis=1)
+        fits = (model.body_mass[rows] > 0) & (moments[:, 0] > 0)
+        possible += bool(np.all(fits & (moments[:, 2] <= moments[:, :2].sum(axis=1) * (1 + 1e-9))))
+    return {"draws": DRAWS, "possible": possible}
+
+
 def model_space(scene: Scene, model: str) -> Space:
     """The parameters of one of MODELS."""
     friction = joint_friction_space(scene.joints)
     if model == "inertia":
         return friction + inertia_space(scene.joints)
-    return friction + link_nuisances(scene) if model == "links" else friction
+    more = {"links": link_nuisances, "bodies": link_bodies}.get(model)
+    return friction if more is None else friction + more(scene)
 
 
 # Fit ---------------------------------------------------------------------------------------
@@ -328,6 +353,7 @@ def main(config: RealPanda) -> None:
     fits = fit_models(scene, parts, config)
     search, others, clock = fits.pop("search"), fits.pop("other_priors", []), fits.pop("held_out_clock")
     held = fits.pop("set_valued", None)
+    bodies = possible_bodies(scene, fits["bodies"]["estimate"], config.seed) if "bodies" in fits else None
     results = {model: summary(fit, published) for model, fit in fits.items()}
     for model, result in results.items():
         show(model, result)
@@ -359,6 +385,7 @@ def main(config: RealPanda) -> None:
         "joints_halved_by_model": {model: r["joints_halved"] for model, r in results.items()},
         "models": results,
         "links_under_other_priors": others,
+        "possible_bodies": bodies,
         "friction_at_rest": None if held is None else at_rest(held, published),
         "targets": {
             "held_out_halved_on_most_joints": lead["joints_halved"] >= 4,
