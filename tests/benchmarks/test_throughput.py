@@ -85,6 +85,8 @@ def test_peak_memory_counts_what_was_freed_again(tmp_path):
 
 def rows_by_hand() -> list:
     rows = [
+        throughput.Row(throughput.OWN, 32, 100, 0.4, 0.0),
+        throughput.Row(throughput.C, 32, 100, 0.2, None),
         throughput.Row(throughput.OWN, 256, 100, 2.0, 9.0),
         throughput.Row(throughput.WHOLE, 256, 100, 4.0, 11.0),
         throughput.Row(throughput.C, 256, 100, 0.5, None),
@@ -107,6 +109,7 @@ def test_headline_compares_at_256_with_the_c_runs_between():
         "mjx_one_block_steps_per_s": 6400.0,
         "c_steps_per_s": 51200.0,
         "ratio_to_c": 0.25,
+        "ratio_to_c_32": 0.5,
         "mjx_step_option_steps_per_s": 3200.0,
         "mjx_step_all_devices_steps_per_s": 5120.0,
         "untuned_steps_per_s": 40.0,

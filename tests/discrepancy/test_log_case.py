@@ -14,13 +14,15 @@ from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elb
 
 from droid_jax.cost.lone_log import LoneLog
 from droid_jax.discrepancy import log_case
+from droid_jax.discrepancy.candidates import directions_of, score_test
 from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import at_values
 from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, refitted_residual, single_case
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
-from droid_jax.model.effects.candidate import EffectKey
+from droid_jax.model.effects.candidate import EffectKey, candidates
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space

@@ -124,7 +124,7 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
         ({"recordings": [elbow_log(0.0, 2.0, 15)]}, "is the only one and has 15 repeats"),
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the train and the validation recording are the same"),
         ({"effects": ()}, "effects: there is none to test"),
-        ({"effects": [Effect("late")]}, "none of the effects says its locations"),
+        ({"effects": [Effect("late")]}, "none of the effects states its locations"),
         ({"effects": [LATE]}, "no commands that an effect could change: late"),
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],

@@ -89,7 +89,7 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
         for u in (0.93, 0.88, 0.91)
     ]
     case = SimpleNamespace(
-        train=SimpleNamespace(resampling=SimpleNamespace(repeated=repeated)), config=DiscrepancyConfig()
+        train=SimpleNamespace(resampling=SimpleNamespace(repeated=repeated)), both=None, config=DiscrepancyConfig()
     )
     problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
     asked = dict(left)
@@ -368,7 +368,7 @@ def test_what_has_converged_is_fitted_no_further(found: Small, monkeypatch: pyte
 
 def test_effects_without_locations_cannot_be_asked_about(found: Small):
     nowhere = tuple(replace(e, locations={}) for e in found.case.effects)
-    with pytest.raises(ValueError, match="none of the effects says its locations"):
+    with pytest.raises(ValueError, match="none of the effects states its locations"):
         search_effects(replace(found.case, effects=nowhere), found.base, FLOOR)
 
 

@@ -25,7 +25,7 @@ def test_candidates_are_effects_at_locations_with_shapes():
 
 
 def test_effects_without_locations_are_refused():
-    with pytest.raises(ValueError, match="none of the effects says its locations"):
+    with pytest.raises(ValueError, match="none of the effects states its locations"):
         candidates([Effect("nowhere")])
 
 
