@@ -38,12 +38,11 @@ from droid_jax.discrepancy.candidates import (  # noqa: E402
     ScoreTest,
     directions_of,
     observable_effects,
-    score_test,
 )
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step, with_step_difference  # noqa: E402
+from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step  # noqa: E402
 from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
-from droid_jax.discrepancy.search import search_effects  # noqa: E402
+from droid_jax.discrepancy.search import search_effects, tested, with_step_differences  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
 from droid_jax.model.effect_interface import Effect  # noqa: E402
 from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
@@ -271,8 +270,8 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
         result["prepared"] = time.monotonic() - began
         model = base_model(case)
         result["fitted"] = time.monotonic() - began
-        case = replace(case, train=with_step_difference(case.train, model, with_finer_step(case.train, case.base, log)))
-        screen = score_test(case.train, model, directions_of(candidates(case.effects)), config.seed)
+        case = with_step_differences(case, model, with_finer_step(case.train, case.base, log))
+        screen = tested(case, model, directions_of(candidates(case.effects)))
         result |= {
             "p": screen.p,
             "discrepancy": model.discrepancy,

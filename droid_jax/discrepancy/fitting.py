@@ -354,14 +354,6 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
     return replace(residual_set, step_difference=off)
 
 
-def with_same_step(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> ResidualSet:
-    """`with_step_difference` of other instants of the same logs as those that `fine` was made for."""
-    known = residual_set.cost
-    if isinstance(fine, WindowedLog) and isinstance(known, WindowedLog):
-        fine = replace(fine, whitener=known.whitener, instants=known.instants)
-    return with_step_difference(residual_set, model, fine)
-
-
 def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
     """A model that was fitted elsewhere, with its residuals and slopes in another residual set; nothing is fitted."""
     full = residual_set.cost.space

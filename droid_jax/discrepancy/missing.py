@@ -29,12 +29,10 @@ from droid_jax.discrepancy.fitting import (
     final_refit,
     final_refit_due,
     with_finer_step,
-    with_same_step,
-    with_step_difference,
 )
 from droid_jax.discrepancy.log_case import base_model, case_of
 from droid_jax.discrepancy.results import extended
-from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.search import search_effects, with_step_differences
 from droid_jax.discrepancy.verdict import Experiment, Verdict
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
@@ -141,8 +139,7 @@ def search(
         model = base_fit(case.train, case.base, case.config, report, start)
     if split is not Split.BLOCKS:
         report("discretisation_error", None)
-        both = None if case.both is None else with_same_step(case.both, model, fine)
-        case = replace(case, train=with_step_difference(case.train, model, fine), both=both)
+        case = with_step_differences(case, model, fine)
     verdict = search_effects(case, model, discretisation_error(case.train, model), report)
     report("verdict", None)
     return case, verdict

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from droid_jax.cost.cost import Cost
+from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import (
     Proposal,
     ScoreDirection,
@@ -33,6 +35,7 @@ from droid_jax.discrepancy.fitting import (
     refit,
     remaining_discrepancy,
     remaining_residuals,
+    with_step_difference,
 )
 from droid_jax.discrepancy.selection import (
     WEAK,
@@ -157,10 +160,24 @@ def _explained(problem: Problem, model: FittedModel) -> bool:
     if not asked:
         return True
     problem.progress("score_test", model.name)
-    return _nothing_more(problem, model, _tested(case, model, asked))
+    return _nothing_more(problem, model, tested(case, model, asked))
 
 
-def _tested(case: Case, model: FittedModel, asked: Sequence[ScoreDirection]) -> ScoreTest:
+def with_step_differences(case: Case, model: FittedModel, fine: Cost | None) -> Case:
+    """The case, its training recording and the blocks of both parts knowing what a quarter of the time step changes.
+
+    fine: what `with_finer_step` made of the training recording.
+    """
+    both = case.both
+    if both is not None:
+        same = fine
+        if isinstance(fine, WindowedLog) and isinstance(both.cost, WindowedLog):
+            same = replace(fine, whitener=both.cost.whitener, instants=both.cost.instants)
+        both = with_step_difference(both, model, same)
+    return replace(case, train=with_step_difference(case.train, model, fine), both=both)
+
+
+def tested(case: Case, model: FittedModel, asked: Sequence[ScoreDirection]) -> ScoreTest:
     """The score test of the training recording; its p-value is that of all blocks, where validation has the others.
 
     What is tried next goes by the training blocks alone, so that the validation blocks judge it.
@@ -187,7 +204,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     if not asked:
         return replace(state, finished=True, exhausted=True), None
     problem.progress("score_test", model.name)
-    found = _tested(case, model, asked)
+    found = tested(case, model, asked)
     thresholds = case.config.selection
     exhausted = _nothing_more(problem, model, found)
     info, notes = SelectionStep(found), Notes()
@@ -517,7 +534,7 @@ def without_small_gains(
             continue
         problem.progress("score_test", tried[k].name)
         if asked := open_directions(problem.directions, tried[k]):
-            found = _tested(case, tried[k], asked)
+            found = tested(case, tried[k], asked)
             if found.p < case.config.selection.significance:
                 break  # what explains less leaves more
         out[k] = replace(tests[k], reasons=tuple(r for r in tests[k].reasons if r.reason is not Reason.SMALL_GAIN))
