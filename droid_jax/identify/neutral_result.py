@@ -354,7 +354,7 @@ def _lacking(
             table = any(isinstance(t, LawTable) for t in mine)
             without = next((t.why for t in mine if isinstance(t, NoTable)), "")
             why = (
-                "`forces` of apply_fit.py has its law"
+                "`forces` of apply_fit.py has its law" + (", but not what is read otherwise" if effect.observe else "")
                 if table
                 else without or ("it changes what is read, not what moves" if effect.observe else "it has no table")
             )

@@ -1,8 +1,9 @@
 """Gears that give way: elastic joints, and joints with backlash.
 
 The servo measures the motor, the dynamics move the link.  Under a torque tau the motor stands at q + tau c in an
-elastic joint; in one with backlash it turns freely within half of it to either side of the link.  Both are
-quasi-static: ringing is not simulated.
+elastic joint, and its encoder says so: that is the position that is recorded.  In a joint with backlash the motor turns
+freely within half of it to either side of the link, which is recorded.  Both are quasi-static: ringing is not
+simulated.
 
 The torque is solved for with the servo's own law, whose gains and damping may be fitted.  Feeding back the torque of
 the step before would be simpler, but a stiff servo makes that a loop with a gain above one, which chatters.
@@ -10,7 +11,7 @@ the step before would be simpler, but a stiff servo makes that a loop with a gai
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +88,7 @@ def _servos(scene: Scene) -> _Servos | None:
 
 @register
 def joint_compliance(scene: Scene) -> Effect | None:
-    """Motor ahead of the link by tau c, c = 1 / stiffness, rad/(N m).
+    """Motor, and the encoder on it, ahead of the link by tau c, c = 1 / stiffness, rad/(N m).
 
     What shows is c beside the servo's own 1 / k: of a soft servo only a softer gear does.
     """
@@ -101,6 +102,17 @@ def joint_compliance(scene: Scene) -> Effect | None:
         torque = servos.rigid_torque(state, ctrl) / yielding
         return servos.with_lead(state, ctrl, compliance * torque)
 
+    columns = np.array([scene.joints.index(j) for j in servos.joints], dtype=int)
+
+    def observe(theta, rollout):
+        twist = column(theta, COMPLIANCE, servos.joints) * rollout.torque[:, columns]
+        step = (rollout.time[-1] - rollout.time[0]) / (len(rollout.time) - 1)
+        return replace(
+            rollout,
+            position=rollout.position.at[:, columns].add(twist),
+            velocity=rollout.velocity.at[:, columns].add(jnp.gradient(twist, axis=0) / step),
+        )
+
     usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
 
     def parameter(joint: str, stiffness: float):
@@ -112,6 +124,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         COMPLIANCE,
         tuple(parameter(j, float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)),
         servo=servo,
+        observe=observe,
         description="an elastic gear between motor and link",
         signature="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),

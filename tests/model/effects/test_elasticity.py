@@ -9,7 +9,7 @@ import pytest
 from effect_bench import ARM, door, mechanism
 
 from droid_jax.discrepancy.candidates import SMALL
-from droid_jax.model.effect_interface import State
+from droid_jax.model.effect_interface import Rollout, State
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import servo_scale
@@ -41,6 +41,25 @@ def test_inside_the_play_there_is_no_torque_and_an_elastic_gear_gives_in_proport
     np.testing.assert_allclose(torque(play), 0.0, atol=1e-5)
     soft = compliance.servo({f"joint_compliance[{j}]": 1e-3 for j in ARM}, state, ctrl)
     np.testing.assert_allclose(torque(soft), 0.002 / (1.0 / stiffness + 1e-3), rtol=1e-4)
+
+
+def test_what_is_recorded_of_an_elastic_gear_is_its_motor():
+    """The servo's own encoder sits there: a log of positions alone was compared with the links."""
+    scene = mechanism()
+    (effect,) = library(scene, ["joint_compliance"])
+    assert effect.observe is not None
+    time, joints = jnp.linspace(0.0, 2.0, 101), len(scene.joints)
+    torque = jnp.sin(3 * time)[:, None] * jnp.arange(1.0, joints + 1)
+    still, none = jnp.zeros((101, joints)), jnp.zeros((101, 0), bool)
+    rollout = Rollout(time, torque, still, still, jnp.zeros(101), none, jnp.array(True))
+    joint = ARM[0]
+    column = scene.joints.index(joint)
+    seen = effect.observe({f"joint_compliance[{joint}]": jnp.float32(1e-3)}, rollout)
+    np.testing.assert_allclose(seen.position[:, column], 1e-3 * torque[:, column], rtol=1e-5)
+    slope = 3e-3 * (column + 1) * np.cos(3 * np.asarray(time))
+    np.testing.assert_allclose(seen.velocity[1:-1, column], slope[1:-1], atol=1e-5 * joints)
+    others = np.delete(np.arange(joints), column)
+    assert not np.any(seen.position[:, others]) and np.array_equal(seen.torque, torque)
 
 
 def test_an_elastic_gear_is_tried_at_a_size_that_shows_beside_its_servo():
