@@ -147,7 +147,8 @@ class DiscrepancyConfig:
         one_step: of the one step that candidates get.
         polish: of the selected model, with slopes over the width of its posterior: its intervals are reported.
         one_step_fits: candidates that get one Levenberg-Marquardt step in each selection step.
-        full_refits: the best of these, refitted in full.
+        full_refits: the best of these, refitted in full; among them
+        sure_refits: the first of the ranking, whatever their one step did: a few trials may miss a strong effect.
         pair_refits: pairs of effects refitted.
         max_effects: in a model.
         budget_minutes: for all refits, None for no limit; at least one candidate of a selection step is always tried.
@@ -175,6 +176,7 @@ class DiscrepancyConfig:
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
     one_step_fits: int = 12
     full_refits: int = 6
+    sure_refits: int = 2
     pair_refits: int = 4
     max_effects: int = 3
     budget_minutes: float | None = None
@@ -191,6 +193,7 @@ class DiscrepancyConfig:
         check_fields(
             self,
             **dict.fromkeys(("one_step_fits", "full_refits", "pair_refits", "max_effects"), partial(whole, least=1)),
+            sure_refits=partial(whole, least=0),
             **dict.fromkeys(("refine", "refit", "polish"), partial(instance, kind=RefineConfig)),
             search=partial(instance, kind=CmaConfig),
             one_step=partial(instance, kind=LevenbergMarquardtConfig),

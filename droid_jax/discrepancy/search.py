@@ -243,7 +243,9 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     ranked = proposals(found, model.residuals, case.full_space)
     begun = SelectionStep(found, model.keys, tuple(ranked))
     promising, notes = _one_step_fits(problem, model, ranked[: config.one_step_fits], found)
-    best = sorted(promising, key=lambda look: look[1])[: config.full_refits]
+    sure, others = promising[: config.sure_refits], promising[config.sure_refits :]
+    others = sorted(others, key=lambda look: look[1])[: max(config.full_refits - len(sure), 0)]
+    best = sorted([*sure, *others], key=lambda look: look[1])[: config.full_refits]
     starters = [((*model.parts, *p.parts), values) for values, _, p in best]
     tried, more = staged_refit(problem, starters, target_objective(problem, model), "candidates not refitted")
     notes += more
