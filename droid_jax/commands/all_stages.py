@@ -120,14 +120,13 @@ def run(command: All) -> None:
     if "evaluate" in command.stages:
         evaluate.needs_trials(command.trials)
     runtime.start()  # before the recording, which would start jax untuned
-    from droid_jax.identify.results import prepare_folder
     from droid_jax.model.effects.registry import check_scale
 
     check_scale(command.effect_scale)
     load_effects(command.user_effects)
     roles = _roles(command)
     _needs_robot(command)
-    out = prepare_folder(command.out)
+    out = command.out
     if {*IN_A_SCENE} & {*command.stages}:
         _remember(command, out)
     if command.again:  # now: one that a stop leaves unreached is not to pass for this run's; the first does so itself

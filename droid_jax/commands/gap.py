@@ -129,7 +129,6 @@ def run(command: GapCommand) -> None:
     warn_of_cpu(command.preset)
     from droid_jax.discrepancy.log_case import case_of, open_loop_errors
     from droid_jax.discrepancy.results import write_amended, write_gap
-    from droid_jax.identify.results import prepare_folder
     from droid_jax.preflight.check_log import check_log, refuse_certain
     from droid_jax.preflight.search_inputs import assigned_roles
     from droid_jax.recordings.split import Split
@@ -161,7 +160,6 @@ def run(command: GapCommand) -> None:
     if split is Split.BLOCKS and start is not None:
         print("a log without repeats is fitted without a search: --fit is not needed")
     config = gap_config(command)
-    prepare_folder(out)  # only now, with all input read
     if not given:
         assert command.springs is not None  # settled
         roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)

@@ -126,7 +126,7 @@ def run(command: Identify) -> None:
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.identify.pipeline import cost_samples, prepare, run_fit
-    from droid_jax.identify.results import prepare_folder, write_run
+    from droid_jax.identify.results import write_run
     from droid_jax.identify.solution_checks import creep_of_fit
     from droid_jax.preflight.check_log import check_log, refuse_certain
     from droid_jax.preflight.preflight import command_notes
@@ -150,7 +150,6 @@ def run(command: Identify) -> None:
     _needs_demonstrations(command, given)
     if not command.force:
         refuse_certain(scene, (*given, *judges))
-    prepare_folder(out)  # only now, with all input read
     recordings, truth, known = _recordings(command, scene, out, given)
     print("compiling the replay ...", flush=True)
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judges)

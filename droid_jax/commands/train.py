@@ -64,7 +64,6 @@ def run(command: Train) -> None:
     runtime.start()
     warn_of_cpu(command.preset)
     from droid_jax.door.environment import DoorEnv
-    from droid_jax.identify.results import prepare_folder
     from droid_jax.policy.network import save_policy
     from droid_jax.policy.randomise import of_method
     from droid_jax.policy.train import train
@@ -86,7 +85,6 @@ def run(command: Train) -> None:
         return
     config = train_config(command)
     env, randomise = DoorEnv(scene, effects=effects), of_method(command.method, scene, gaussian)
-    prepare_folder(out)  # only now, with all input read
     begin(out, setup, command.again, "train")
     gaussian.save(out / GAUSSIAN)
     model = None if fit is None else extended_of(fit)

@@ -211,7 +211,7 @@ class CmaState:
         self.records.setdefault("seconds", [])
 
 
-def starts(full: Space, space: Space, found: Fit, effects: Sequence[str] = ()) -> np.ndarray:
+def starts(full: Space, space: Space, found: Fit, coefficients: Sequence[str] = ()) -> np.ndarray:
     """[S, F] where the refinement begins: the search's best, the initial means, these with a firm grip where the space
     has the friction of one, and the search's best with effects that do not act in it (`with_acting`).
 
@@ -221,19 +221,19 @@ def starts(full: Space, space: Space, found: Fit, effects: Sequence[str] = ()) -
     pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
     firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
     return np.stack(
-        [searched, full.mean, *([full.values(firm)] if firm else []), *with_acting(full, searched, effects)]
+        [searched, full.mean, *([full.values(firm)] if firm else []), *with_acting(full, searched, coefficients)]
     )
 
 
-def with_acting(space: Space, values: np.ndarray, effects: Sequence[str]) -> list[np.ndarray]:
+def with_acting(space: Space, values: np.ndarray, coefficients: Sequence[str]) -> list[np.ndarray]:
     """`values` [F] with the effects that stand neutral on a bound a prior deviation off it; nothing where none does.
 
     A limit that acts and one that does not are different basins: where it is out of reach, no slope tells of it.
 
-    effects: names of their parameters.
+    coefficients: of effects that the space holds, by name.
     """
     acting = values.copy()
-    for p in map(space.__getitem__, effects):
+    for p in map(space.__getitem__, coefficients):
         at, way = space.index(p.name), (p.mean == p.low) - (p.mean == p.high)
         if way and bound_of(p, float(values[at])) == ("lower" if way > 0 else "upper"):
             acting[at] = np.clip(p.mean + way * p.std, p.low, p.high)

@@ -404,14 +404,14 @@ def _refined(
     base: Cost,
     early: Cost,
     begin: np.ndarray,
-    effects: Sequence[str],
+    coefficients: Sequence[str],
     config: IdentifyConfig,
     settings: RefineConfig,
     report: Callable[[Any], None],
 ) -> tuple[Cost, Refined]:
     """The refinement from starts [S, F], and the cost it ended on; early: of the recordings' beginnings, or the same.
 
-    effects: names of their parameters.  The beginning of a chirp is slow and does not show what limits its end, so that
+    coefficients: of effects, by name.  The beginning of a chirp is slow and does not show what limits its end, so that
     where some do not act, a few iterations on the whole of the recording that is fitted worst tell whether they would.
 
     The noise of a single repeat is not known: it is stated from what the search, a first refinement and these
@@ -431,7 +431,7 @@ def _refined(
     base, count = base.restated(first.best), first.evaluations
     # The first one has looked for other basins, and in plain C twice where nothing was found.
     settled = replace(settings, basin_hops=0, patience=(config.refine or settings).patience)
-    if acting := with_acting(base.space, first.best, effects):
+    if acting := with_acting(base.space, first.best, coefficients):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
         short = replace(settled, iterations=config.sorting, spreads=0, pruning_ratio=config.sorting_ratio)
         first = run(worst, None, np.stack([first.best, *acting]), short)

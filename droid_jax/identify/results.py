@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -47,17 +46,6 @@ from droid_jax.preflight.findings import Finding
 from droid_jax.storage import config_json, finite, write_csv, write_json, write_npz
 
 FORMAT = "droid_jax fit"
-
-
-def prepare_folder(folder: Path) -> Path:
-    """Make a results folder and see that it can be written; OSError becomes one clear ValueError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ValueError(f"the results folder {folder} cannot be written: {error.strerror or error}") from None
-    return folder
 
 
 def write_run(
