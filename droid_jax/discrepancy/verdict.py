@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -268,7 +268,7 @@ def conclude(
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
-        doubts=doubts(case.train, model, case.natural_bounds),
+        doubts=(*doubts(case.train, model, case.natural_bounds), *worse_on_test(discrepancies, model)),
     )
     return unnamed(case, verdict) if closes_too_little(verdict) else verdict
 
@@ -316,6 +316,14 @@ def _discrepancies(
                 raise
             return found, (LOST,)
     return found, ()
+
+
+def worse_on_test(discrepancies: Mapping[str, tuple[float, float]], model: FittedModel) -> tuple[str, ...]:
+    """A doubt where the test recording is matched worse with the effects than without: they do not carry over to it."""
+    before, after = discrepancies.get("test", (0.0, 0.0))
+    if not model.parts or after <= before:
+        return ()
+    return (f"the test recording is matched worse with it, U {before:.3g} before and {after:.3g} after",)
 
 
 def _remains(case: Case, residuals: np.ndarray, before: float, discretisation_error: float, exhausted: bool) -> bool:

@@ -17,7 +17,7 @@ from droid_jax.discrepancy.results import gap_json
 from droid_jax.discrepancy.search import Notes, SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
-from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude
+from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worse_on_test
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 
@@ -327,3 +327,13 @@ def test_what_lost_for_one_reason_alone_is_said(found: Small, reason: Reason, wh
 def test_doubts_end_the_sentence(found: Small):
     doubted: Verdict = replace(found.verdict, doubts=("it is large", "its form does not fit"))
     assert doubted.sentence == f"{found.verdict.sentence} But it is large. But its form does not fit."
+
+
+def test_a_test_recording_that_is_matched_worse_is_a_doubt(found: Small):
+    """Friction fitted at low gains let a servo stick at a higher one, and the verdict did not say so."""
+    model = found.verdict.model
+    assert model.parts and found.verdict.doubts == ()
+    assert worse_on_test({"test": (1.0, 0.9)}, model) == worse_on_test({"validation": (0.1, 0.2)}, model) == ()
+    assert worse_on_test({"test": (0.1, 0.2)}, replace(model, parts=())) == ()
+    (said,) = worse_on_test({"test": (0.1155, 1.0168)}, model)
+    assert said == "the test recording is matched worse with it, U 0.116 before and 1.02 after"
