@@ -5,7 +5,7 @@
 
 The base model is mass, viscous damping and a constant offset.  The published model has dry friction beside them
 (20.4 N), and a better one that differs between the directions, above all in its viscous part (167 and 240 N s/m).
-One log, no repeats: the search of `droid_jax.discrepancy.single` on the first two thirds of DATA_EMPS, judged on its
+One log, no repeats: the search of `droid_jax.discrepancy.log_case` on the first two thirds of DATA_EMPS, judged on its
 last third and on DATA_EMPS_PULSES, another run.  Data and filter: see real_emps.py.
 
 The library has no viscous friction that differs between the directions.  `uneven_damping` below is such an effect

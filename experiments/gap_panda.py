@@ -5,7 +5,7 @@
 
 The base model is the bare arm: link masses (3 %) and centres of mass (5 mm) as nuisances, viscous friction and a
 constant offset in every joint.  Published for this very log is dry friction in every joint.  One log, no repeats: the
-search of `discrepancy.single` on the first two thirds, judged on the last, which repeats a motion that was fitted.
+search of `discrepancy.log_case` on the first two thirds, judged on the last, which repeats a motion that was fitted.
 
 Each joint's friction is a seventh of what is missing, and no seventh takes a fifth of the gap, which an effect must.
 So every effect of a joint is also asked about in all joints at once, as one candidate with an amplitude for each; in
