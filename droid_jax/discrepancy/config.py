@@ -111,6 +111,8 @@ class BlocksConfig:
     refit_share: share of a column's squared residual that a candidate must take linearly to be fitted in full for that.
     least_gain: share of U, noise included, that a first effect must take where it leaves nothing to find, in place of
         `SelectionConfig.least_gain` (an arm's log with nothing hidden and p = 0.002: 5 %; two with: 10 and 13 %).
+    cross_validated: models of a step whose gain is tested with both halves of the log in turns, where the validation
+        blocks alone do not confirm it.
     equivalence_factor: as `SelectionConfig.equivalence_factor`; closer to one, since U of a block holds the noise.
     prior_slack: as `SelectionConfig.prior_slack`; what priors hold back is in every block alike and would look like an
         effect (below p = 0.2: 8 of 40 Panda logs, 19 with the priors unchanged).
@@ -122,6 +124,7 @@ class BlocksConfig:
     noise_share: float = 0.2
     refit_share: float = 0.3
     least_gain: float = 0.08
+    cross_validated: int = 2
     equivalence_factor: float = 1.5
     prior_slack: float = 30.0
 
@@ -130,6 +133,7 @@ class BlocksConfig:
             self,
             **dict.fromkeys(("correlation_times", "shortest"), partial(number, least=0)),
             **dict.fromkeys(("equivalence_factor", "prior_slack"), partial(number, least=1)),
+            cross_validated=partial(whole, least=0),
             **dict.fromkeys(
                 ("fitted_share", "noise_share", "refit_share", "least_gain"), partial(number, least=0, most=1)
             ),

@@ -25,7 +25,7 @@ from droid_jax.discrepancy.candidates import (
     rows_of,
     score_test,
 )
-from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.case import Case, ResidualSet
 from droid_jax.discrepancy.config import CONVERGE_ITERATIONS
 from droid_jax.discrepancy.fitting import (
     FittedModel,
@@ -44,9 +44,11 @@ from droid_jax.discrepancy.selection import (
     ValidationTest,
     much_more,
     selected,
+    significance_reasons,
     validation_tests,
     without_dominated,
 )
+from droid_jax.discrepancy.statistics import one_sided_p
 from droid_jax.discrepancy.verdict import Verdict, conclude, more_than_step_error, open_share
 from droid_jax.distributed import agreed
 from droid_jax.identify.multistart import RefineConfig
@@ -507,6 +509,7 @@ def _decided(
         seed=case.config.seed,
         natural_bounds=case.natural_bounds,
     )
+    tests = confirmed_in_turns(problem, before, tried, tests)
     tests = without_small_gains(problem, before, tried, tests)
     tested = list(zip(tried, tests, strict=True))
     won = selected(tested, u0, problem.base_discrepancy, config)
@@ -515,6 +518,46 @@ def _decided(
     tests = without_dominated(tested, won, case.effects, u0, config)
     winner, chosen = won
     return replace(done, tests=tuple(tests), selected=winner, chosen=chosen)
+
+
+def confirmed_in_turns(
+    problem: Problem, before: FittedModel, tried: Sequence[FittedModel], tests: Sequence[ValidationTest]
+) -> list[ValidationTest]:
+    """The tests with both halves of a log for the best models that the validation blocks alone do not confirm.
+
+    Fitted to the validation blocks, a model is judged on the training blocks: twice as many blocks tell its gain from
+    chance (two-fold cross-validation).  Asked for where nothing else but its size is against a model.
+    """
+    out, case = list(tests), problem.case
+    if case.both is None:
+        return out
+    for k in np.argsort([t.discrepancy_validation for t in tests]).tolist()[: case.config.blocks.cross_validated]:
+        reasons = {r.reason for r in tests[k].reasons}
+        if Reason.NOT_CONFIRMED not in reasons or reasons - WEAK - {Reason.SMALL_GAIN} or problem.late:
+            continue
+        problem.progress("refit", f"{tried[k].name}, halves of the log in turns")
+        try:
+            p = _p_in_turns(case, before, tried[k])
+        except NotReplayed:
+            continue
+        kept = (r for r in tests[k].reasons if r.reason is not Reason.NOT_CONFIRMED)
+        out[k] = replace(tests[k], p=p, reasons=(*significance_reasons(p, case.config.selection), *kept))
+    return out
+
+
+def _p_in_turns(case: Case, before: FittedModel, model: FittedModel) -> float:
+    """p-value of a model's gain over the blocks of validation, fitted to training, and the other way round."""
+
+    def gains(judged: ResidualSet, without: FittedModel, extended: FittedModel) -> np.ndarray:
+        rows = judged.resampling
+        commons = judged.common(np.stack([without.values, extended.values]))
+        if not np.isfinite(commons).all():
+            raise NotReplayed(f"the simulation of {judged.comparison.name!r} blows up")
+        losses = [np.sum((rows.residuals(common) / rows.units) ** 2, axis=1) for common in commons]
+        return 0.5 * (losses[0] - losses[1])
+
+    other = [refit(case.validation, case.base, m.parts, m.values[None], case.config.refit) for m in (before, model)]
+    return one_sided_p(np.concatenate([gains(case.validation, before, model), gains(case.train, *other)]))
 
 
 def without_small_gains(

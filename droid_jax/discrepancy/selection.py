@@ -171,7 +171,7 @@ def validation_tests(
         else:
             enough = left[k + 1] <= (1 - config.least_gain) * left[0]
         reasons = [
-            *_significance_reasons(p, config),
+            *significance_reasons(p, config),
             *_size_reasons(train, model, spans, minimum_sizes),
             *_gain_reasons(left[0], left[k + 1], base_discrepancy, enough, discretisation_error, config),
             *_coefficient_reasons(train, model, spans, natural_bounds),
@@ -240,7 +240,8 @@ def much_more(
     return rest <= share * left and left - rest >= config.least_share * base_discrepancy
 
 
-def _significance_reasons(p: float, config: SelectionConfig) -> list[Rejection]:
+def significance_reasons(p: float, config: SelectionConfig) -> list[Rejection]:
+    """A gain that chance may make is a reason against an effect."""
     if p < config.confirmation:
         return []
     return [Rejection(Reason.NOT_CONFIRMED, f"not confirmed by the validation recording (p = {p:.2g})")]

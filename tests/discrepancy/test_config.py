@@ -91,4 +91,4 @@ def test_the_thresholds_are_those_of_the_published_runs():
         generality_factor=0.9, open_share=0.1, minimum_closed=0.4, mostly_explained=0.5, shape_interval_share=0.5,
         false_discovery_rate=0.1,
     )  # fmt: skip
-    assert BlocksConfig() == BlocksConfig(1.5, 0.5, 2 / 3, 0.2, 0.3, 0.08, 1.5, 30.0)
+    assert BlocksConfig() == BlocksConfig(1.5, 0.5, 2 / 3, 0.2, 0.3, 0.08, 2, 1.5, 30.0)

@@ -108,6 +108,35 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     assert search.without_small_gains(problem, extended, models, tests) == tests  # beside another effect
 
 
+@pytest.mark.parametrize(
+    ("both", "reasons", "asked"),
+    [
+        ("both", (Reason.NOT_CONFIRMED,), "bc"),  # the two best
+        ("both", (Reason.NOT_CONFIRMED, Reason.BELOW_MINIMUM_SIZE, Reason.SMALL_GAIN), "bc"),
+        ("both", (Reason.NOT_CONFIRMED, Reason.MAY_BE_ZERO), ""),  # something else is against it
+        ("both", (Reason.SMALL_GAIN,), ""),  # it is confirmed
+        (None, (Reason.NOT_CONFIRMED,), ""),  # other repeats or motions validate
+    ],
+)
+def test_the_best_models_are_confirmed_with_the_halves_of_a_log_in_turns(
+    monkeypatch: pytest.MonkeyPatch, both: Any, reasons: tuple[Reason, ...], asked: str
+):
+    models: Any = [SimpleNamespace(name=name) for name in "abc"]
+    tests: Any = [
+        ValidationTest((), 0, 0.9, u, 0.2, {}, 1.0, tuple(Rejection(r, "") for r in reasons)) for u in (0.93, 0.88, 0.9)
+    ]
+    case = SimpleNamespace(both=both, config=DiscrepancyConfig())
+    problem: Any = SimpleNamespace(case=case, late=False, progress=quiet)
+    found = {"b": 0.01, "c": 0.3}
+    monkeypatch.setattr(search, "_p_in_turns", lambda case, before, model: found[model.name])
+    judged = search.confirmed_in_turns(problem, SimpleNamespace(), models, tests)  # type: ignore[arg-type]
+    assert [t.p for t in judged] == [found[m.name] if m.name in asked else 0.2 for m in models]
+    confirmed = {
+        m.name for m, t in zip(models, judged, strict=True) if Reason.NOT_CONFIRMED not in {r.reason for r in t.reasons}
+    }
+    assert confirmed == ({"b"} if asked else {"a", "b", "c"} if Reason.NOT_CONFIRMED not in reasons else set())
+
+
 def test_where_nothing_else_could_be_asked_nothing_is_left_to_find():
     """One effect at one place: no score test of no direction."""
     model: Any = SimpleNamespace(name="a", parts=(), coefficients=())
