@@ -55,7 +55,8 @@ class Convert:
     """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: it
     is not read."""
     gravity: bool = False
-    """The torque contains what carries the arm's weight."""
+    """The torque contains what carries the arm's weight. A map that says so keeps it; take it out of the map where it
+    is not so."""
     torque_constant: tuple[float, ...] = ()
     """N m (N) at the joint that one unit of the logged torque is, for each torque or one for all: of efforts that are
     amperes or per cent; with --units torque=mA (or force=mA) that one A is. A negative one turns the sign."""
@@ -153,6 +154,8 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     from droid_jax.recordings.column_map import check_map_target, map_beside, write_map
     from droid_jax.recordings.log_files import read_log
 
+    if any("=" in joint for joint in command.joints):
+        raise ValueError("--joints NAME=NAME_IN_THE_MESSAGES is for ROS bags; of logs --columns names the columns")
     beside = map_beside(command.out)
     check_map_target(beside)
     recording, columns, origin = read_log(
@@ -179,6 +182,8 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     print(f"columns as in {origin}")
 
     def keep() -> None:
+        if command.map is not None and command.map.resolve() == beside.resolve():
+            return  # the user's own
         write_map(replace(columns, stiffness=[], damping=[]), beside)  # gains are changed between logs
         print(f"the next log of this kind needs no options while {beside} is there")
         if columns.stiffness:

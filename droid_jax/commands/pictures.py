@@ -41,7 +41,10 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
         return
     drive = make_drive(found.scene, recording, weigh=False)
     every, factors = max(1, round(1.0 / (RATE * drive.timestep))), servo_factors(found.scene, drive)
-    models = (scale_gains(make_c_model(found.scene, found.full, v), factors) for v in (found.start, found.best))
+    models = (
+        scale_gains(make_c_model(found.scene, found.full, found.full.with_known(drive.known, v)), factors)
+        for v in (found.start, found.best)
+    )
     before, after = (poses(model, drive.qpos0, drive.command)[::every] for model in models)
     time = drive.timestep * every * np.arange(len(after))
     states = {"time": time, "before": before, "after": after, "recording": np.array(recording.name)}

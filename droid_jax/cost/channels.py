@@ -124,8 +124,8 @@ def _noise(comparison: Comparison, rollout: Rollout, name: str) -> float:
     least = comparison.config.noise.minimum[name]
     if len(channel.values) > 1:
         return max(_scatter(channel), least**2)
-    left = channel.noise.mean - np.asarray(comparison.smoothed(rollout, name))
-    return max(float(np.mean(left**2)), least**2)
+    left, seen = channel.noise.mean - np.asarray(comparison.smoothed(rollout, name)), channel.noise.count > 0
+    return max(float(np.sum(left[seen] ** 2) / max(seen.sum(), 1)), least**2)
 
 
 def _scatter(channel: Measured) -> float:

@@ -234,12 +234,12 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
 
 def check_known(space: Space, recordings: Sequence[Recording]) -> None:
-    """Raise ValueError for parameters that stand for others where no recording says so: they would change nothing."""
+    """Raise ValueError for parameters that stand for others where no fitted recording says so: nothing fits them."""
     named = {value for recording in recordings for value in recording.known.values()}
     if idle := [p.name for p in space.parameters if p.role is Role.STANDS_FOR and p.name not in named]:
         raise ValueError(
-            f"parameters {', '.join(idle)} stand for others in recordings that say so, and none does: state it there "
-            f"(`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
+            f"parameters {', '.join(idle)} stand for others in recordings that say so, and no fitted one does: state "
+            f"it there (`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
         )
 
 
@@ -257,6 +257,12 @@ def check_friction_rows(scene: Scene, space: Space, effects: Sequence[Effect]) -
                 "compiled without any, so it would change nothing: use registry.ready(scene) in its place "
                 "(droid_jax.model.effects.registry)"
             )
+
+
+def without_idle(space: Space, recordings: Sequence[Recording]) -> Space:
+    """The space less parameters that stand for others where none of these recordings says so."""
+    named = {value for recording in recordings for value in recording.known.values()}
+    return Space(tuple(p for p in space.parameters if p.role is not Role.STANDS_FOR or p.name in named))
 
 
 def _warn_of_commanded(space: Space) -> None:

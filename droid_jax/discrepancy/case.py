@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -254,7 +254,8 @@ class Case:
             both = {name: cached(getattr(known, name), folder / role, name) for name in ("whitened", "distances")}
             return replace(known, **both)
 
-        return replace(self, **{role: remembering(role, e) for role, e in self.residual_sets.items()})
+        sets = self.residual_sets | ({} if self.both is None else {"both": self.both})
+        return replace(self, **{role: remembering(role, e) for role, e in sets.items()})
 
     @property
     def minimum_sizes(self) -> dict[str, float]:
@@ -300,7 +301,7 @@ def make_case(
         )
     config = comparing(scene, recordings, config)
     scene = ready(scene)
-    base = restrained(base, config.selection.nuisance_bound)
+    base = restrained(base, config.selection.nuisance_bound, {name for r in recordings for name in r.known})
     whole = joined(base, effects)
     spaces = [whole, *[unbounded(whole, per_recording_nuisances(base))] * (len(recordings) - 1)]
     made = zip(recordings, spaces, strict=True)
@@ -347,11 +348,14 @@ def unbounded(whole: Space, names: Sequence[str]) -> Space:
     )
 
 
-def restrained(base: Space, bound: float) -> Space:
-    """The base with every nuisance kept within some prior deviations: what stands further off is an effect."""
+def restrained(base: Space, bound: float, known: Collection[str] = ()) -> Space:
+    """The base with every nuisance kept within some prior deviations: what stands further off is an effect.
+
+    known: those that a recording states, whose values may lie anywhere within their bounds.
+    """
 
     def kept(p: Parameter) -> Parameter:
-        if not p.nuisance:
+        if not p.nuisance or p.name in known:
             return p
         return replace(p, low=max(p.low, p.mean - bound * p.std), high=min(p.high, p.mean + bound * p.std))
 

@@ -355,7 +355,7 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
 
 
 def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
-    """A model that was fitted elsewhere, with its residuals and slopes in another residual set; nothing is fitted."""
+    """A model that was fitted elsewhere, with its slopes in another residual set and what the base leaves there."""
     full = residual_set.cost.space
 
     def residuals(rows: np.ndarray) -> np.ndarray:
@@ -369,7 +369,11 @@ def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
         model.refined, residual=state.residual[0], jacobian=problem.wide_jacobian(state, slopes[0]),
         objective=float(state.objective[0]), prior=problem.prior,
     )  # fmt: skip
-    left = residual_set.resampling.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    root, free = np.sqrt(residual_set.repeats), refined.free
+    # What other instants than the fitted ones ask of the base is in the residuals, and no flip knows it: taken out.
+    held = refined.prior[free] * root * residual_set.prior_slack
+    common = project(-refined.residual[None] / root, refined.jacobian[:, free] / root, held)[0]
+    left = residual_set.resampling.residuals(common)
     return replace(model, refined=refined, residuals=left, discrepancy=residual_set.resampling.discrepancy(left))
 
 

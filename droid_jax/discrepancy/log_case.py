@@ -62,7 +62,7 @@ def make_log(
     Raises ValueError for repeats and for commands, see `lone_log`.
     """
     config = config or DiscrepancyConfig()
-    whole = joined(restrained(base, config.selection.nuisance_bound), effects)
+    whole = joined(restrained(base, config.selection.nuisance_bound, recording.known), effects)
     return lone_log(ready(scene), whole, recording, config.compare, [*known, *effects])
 
 
@@ -293,7 +293,14 @@ def case_of(
     Sensors' gains and encoders' offsets that the base has as parameters are not tested there.
     Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
     """
-    check_known(base, tuple(roles.values()))
+    check_known(base, pooled(roles, "train"))
+    for recording in roles.values():
+        names = {*recording.known, *(v for v in recording.known.values() if isinstance(v, str))}
+        if strange := sorted(names - {*base.names}):
+            raise ValueError(
+                f"recording {recording.name!r} states {', '.join(strange)}, which the base model of a search does not "
+                f"have; it has: {', '.join(base.names)}"
+            )
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
     if split is Split.WINDOWS:
         return windowed_case(
@@ -338,7 +345,7 @@ def windowed_case(
     """
     config = config or DiscrepancyConfig()
     config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
-    base = restrained(base, config.selection.nuisance_bound)
+    base = restrained(base, config.selection.nuisance_bound, {n for r in (*train, *test) for n in r.known})
     share = 1.0 if test else config.blocks.fitted_share
     at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
     compare, windows, judging = config.compare, config.windows, config.windows
@@ -499,10 +506,10 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
             f"Blocks of {made:.2g} s are shorter than the {length:.2g} s for which they would count as independent: "
             "p-values may be too small."
         )
-    if each < FEWEST_REPEATS:
+    if PARTS * each < FEWEST_REPEATS:
         limits.append(
-            f"Only {each} blocks are in each part, and with fewer than {FEWEST_REPEATS} no effect can be told from "
-            "chance, whatever its size: what the score test ranks first is a hint at most. Record for longer."
+            f"Only {PARTS * each} blocks train and validate, and with fewer than {FEWEST_REPEATS} no effect can be "
+            "told from chance, whatever its size: what the score test ranks first is a hint at most. Record for longer."
         )
     turns = _in_groups(log.unit, 0, fitted, PARTS * each)
     blocks = [np.where((turns != OUTSIDE) & (turns % PARTS == p), turns // PARTS, OUTSIDE) for p in range(PARTS)]

@@ -96,7 +96,9 @@ def heldout_distances(
     smoothed, rollouts = cost.smoothed(np.stack([before, after])), cost.rollouts(np.stack([before, after]))
     out: list[HeldoutDistance] = []
     for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
-        rms = np.sqrt(np.mean((smoothed[i] - one.leading.noise.mean) ** 2, axis=1))
+        seen = one.leading.noise.count > 0
+        off = np.where(seen, smoothed[i] - one.leading.noise.mean, 0.0)
+        rms = np.sqrt(np.sum(off**2, axis=1) / np.maximum(seen.sum(axis=0), 1))
         alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
         everything = make_comparison(cost.scene, alike, one.clock, one.config) if recording.repeats > 1 else None
         floor = None if everything is None else _floor(everything)

@@ -256,7 +256,7 @@ def prepare(
     if config.engine == "auto":
         rows = config.search.population * config.search.restarts
         engine = choose_engine(scene, full, [*recordings, *judges], effects, rows)
-    check_known(full, [*recordings, *judges])
+    check_known(full, recordings)
     base = make_cost(scene, full, fitted, engine=engine.engine, config=config.compare, effects=effects, check=False)
     _check_start(base, full)
     if len(chosen) > 1:

@@ -140,8 +140,12 @@ def solution_notes(found: Mapping[str, SolutionCheck], scene: str) -> list[str]:
 
 def creep_of_fit(scene: Scene, space: Space, best: np.ndarray, recordings: Sequence[Recording]) -> list[str]:
     """What is to be known of joints that creep with the fitted values `best` [D] and did not with the scene's own."""
-    fitted = make_c_model(scene, space, best)
-    return [text for r in recordings if not creep_note(scene, r) and (text := creep_note(scene, r, fitted))]
+    said = list[str]()
+    for recording in recordings:
+        fitted = make_c_model(scene, space, space.with_known(recording.known, best))
+        if not creep_note(scene, recording) and (text := creep_note(scene, recording, fitted)):
+            said.append(text)
+    return said
 
 
 def _share(part: float | None, whole: float) -> str:

@@ -365,6 +365,11 @@ class Space:
             return values
         out = np.array(values)
         for of, value in known.items():
+            if strange := [n for n in (of, value) if isinstance(n, str) and n not in self._index]:
+                raise ValueError(
+                    f"a recording states {', '.join(strange)} (known), which is no parameter here: list it, give the "
+                    "effect that has it (--effects), or convert without --known; there are: " + ", ".join(self.names)
+                )
             p = self[of]
             if isinstance(value, str):
                 out[..., self.index(of)] = np.asarray(values)[..., self.index(value)]

@@ -16,7 +16,7 @@ import tomli_w
 
 from droid_jax.arguments import shown
 from droid_jax.read_json import typed
-from droid_jax.recordings.units import CURRENTS, HINGES, KINDS, SLIDES, TIMES
+from droid_jax.recordings.units import COUNTS, CURRENTS, HINGES, KINDS, NORMALISED, SLIDES, TIMES
 from droid_jax.storage import read_text, refuse_foreign, write_text
 
 SUFFIX = ".map.toml"
@@ -222,10 +222,15 @@ def _restated(entry: dict[str, Any], key: str, kind: str, unit: str) -> dict[str
     if not (own := as_list(entry.get("unit") or ())):
         return entry
     if key == "time":
+        if len(own) > 1:  # parts that add up: seconds and nanoseconds
+            return entry
         return {name: value for name, value in entry.items() if name != "unit"}
     known = (SLIDES if kind in ("length", "force") else HINGES)[KINDS[key]]
     per = "/s" if key == "velocity" else ""  # not rpm, which is no angle per second
-    new = [f"{unit}{per}" if one in known and one.endswith(per) else one for one in own]
+    kept = {*COUNTS, *NORMALISED}  # these have numbers of their own beside them
+    if per and unit in kept:
+        return entry
+    new = [f"{unit}{per}" if one in known and one not in kept and one.endswith(per) else one for one in own]
     return {**entry, "unit": new[0] if isinstance(entry["unit"], str) else new}
 
 

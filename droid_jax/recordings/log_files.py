@@ -126,7 +126,9 @@ def _known_map(
     maps are alike which differ in nothing else.
     """
     near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
-    kept = {file: columns for file in near if fits(log, columns := read_map(file))}
+    # Gains are of one log: a map that still has some is of an earlier version, or its author's.
+    maps = {file: msgspec.structs.replace(read_map(file), stiffness=[], damping=[]) for file in near}
+    kept = {file: columns for file, columns in maps.items() if fits(log, columns)}
     if kept:
         newest = max(kept, key=lambda file: file.stat().st_mtime_ns)
         own = changed(kept[newest])

@@ -23,7 +23,8 @@ MOST_BYTES = 2**31  # of a table: ten minutes of fourteen columns at 1 kHz have 
 SAMPLE = 10_000  # rows that tell the types of columns
 SEPARATORS = (",", ";", "\t")
 _LIST_SIGNS = r"[\[\]()]"
-_DECIMAL = r"^[+-]?\d*,?\d+([eE][+-]?\d+)?$"  # a number, with a decimal comma or without
+# A number, with a decimal comma or without, or what stands for none.
+_DECIMAL = r"^(?i:[+-]?(nan|inf)|[+-]?\d*,?\d+(e[+-]?\d+)?)$"
 
 
 def open_csv(path: Path) -> LogColumns:
@@ -87,10 +88,10 @@ def _names_in_comments(comments: Sequence[str], header: str, separator: str, pat
     first = header.split(separator)
     if not all(_text_width(text) for text in first):
         return []
-    for line in reversed(comments):
-        if len(names := line.lstrip("# ").split(separator)) == len(first):
+    for line in comments:  # the first one with as many: units may stand below the names
+        if len(names := line.lstrip("# ").split(separator)) == len({*names}) == len(first):
             return names
-    if first == [str(i) for i in range(len(first))]:  # columns that pandas has numbered
+    if first in ([str(i + begin) for i in range(len(first))] for begin in (0, 1)):  # columns that are numbered
         return []
     raise ValueError(
         f"{path}, line {len(comments) + 1}: expected the names of the columns, got numbers, {shown(header, 60)}; "

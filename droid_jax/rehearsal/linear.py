@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 from droid_jax.arguments import check_fields, number, weights, whole
 from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
+from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, in_turns
 from droid_jax.model.effects.candidate import EffectKey
 
 FAR = 1e3  # deviations of the noise: more than any test asks for
@@ -173,6 +173,19 @@ class LinearModel:
         """[K] direction that a size counts in."""
         return np.where(self.high > 0, 1.0, -1.0)
 
+    @cached_property
+    def tested(self) -> LinearPart:
+        """What the score test is of: the training part, of blocks those of both parts."""
+        train, validation = self.train, self.validation
+        if not (isinstance(train.rows, Blocks) and isinstance(validation.rows, Blocks)) or train is validation:
+            return train
+        assert train.residual is not None and validation.residual is not None
+        return replace(
+            train, raw=train.raw + validation.raw, base=train.base + validation.base,
+            rows=Blocks(in_turns([train.rows.block, validation.rows.block])),
+            residual=train.residual + validation.residual,
+        )  # fmt: skip
+
     @property
     def repeated(self) -> bool:
         """Whether rows are repeats."""
@@ -208,8 +221,8 @@ class LinearModel:
         return float(left @ left / self.train.rows.counted.sum())
 
     def projected(self) -> np.ndarray:
-        """[K, M] sensitivities of the training part, as the score test has them."""
-        return project(self.train.raw, self.train.base, self.held(self.slack))
+        """[K, M] sensitivities as the score test has them."""
+        return project(self.tested.raw, self.tested.base, self.held(self.slack))
 
     @cached_property
     def absorbed(self) -> np.ndarray:

@@ -279,6 +279,7 @@ def robot_trace(
     robot = replace(scene, model=scale_gains(copy.copy(scene.model), servo_factors(scene, drive)))
     start = {**recording.measured_start(), **recording.qpos0}
     hidden = [Applied(case.hidden, case.amplitude, case.joint)] if case.hidden else []
+    values = space.with_known(recording.known, values)
     truth = {name: float(v) for name, v in zip(space.names, values, strict=True)}
     log = record_hidden(
         robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=quiet, space=space

@@ -56,7 +56,8 @@ def smallest_sizes(
     left = [leftover(model, k) for k in wanted]
     about = np.array([_about(of, units) for of in left])
     rows = [of.at(size) for of, size in zip(left, about, strict=True)]
-    scores = score_draws(model, config, np.array([train for train, _ in rows]).reshape(len(rows), -1))
+    asked = [train if model.repeated else train + validation for train, validation in rows]
+    scores = score_draws(model, config, np.array(asked).reshape(len(rows), -1))
     spread, out = fit_deviations(model, config), list[Smallest]()
     for i, (k, of) in enumerate(zip(wanted, left, strict=True)):
         if not np.isfinite(spread[k]) or of.norms[1][-1] < 1e-12:
@@ -167,7 +168,7 @@ def representatives(unit: np.ndarray, close: float) -> np.ndarray:
 
 def score_draws(model: LinearModel, config: RehearsalConfig, asked: np.ndarray) -> ScoreDraws:
     """Noise of the score test of a linear model, drawn `config.draws` times; asked: [A, M] what effects leave."""
-    rows, unit = model.train.rows, _units(np.concatenate([model.projected(), asked]))
+    rows, unit = model.tested.rows, _units(np.concatenate([model.projected(), asked]))
     shown, rng = representatives(unit[: -len(asked)], config.close), np.random.default_rng([config.seed, 1])
     if isinstance(rows, Repeats):
         return _of_repeats(model, unit, len(asked), shown, rng, config)
@@ -277,9 +278,9 @@ def _of_blocks(
 ) -> ScoreDraws:
     count, held = rows.units, model.prior * model.slack
     flips = _some_flips(count, config)
-    left = rows.left_after_flips(unit, model.train.base, held, flips)  # [F, K]
+    left = rows.left_after_flips(unit, model.tested.base, held, flips)  # [F, K]
     inside = [np.flatnonzero(rows.block == b) for b in range(count)]
-    drawn = model.train.noise(config.draws, rng)
+    drawn = model.tested.noise(config.draws, rng)
 
     def of_rows(vectors: np.ndarray, other: np.ndarray) -> np.ndarray:
         """[A, B, N] products of rows of two sets of vectors, block by block, as `Blocks.residuals` scales them."""

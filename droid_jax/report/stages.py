@@ -110,9 +110,11 @@ def gaussian_of(folder: Path) -> Path:
 
 def fingerprint(folder: Path | None) -> str | None:
     """Hash of what a policy is trained on; None for the prior."""
-    if folder is None:
-        return None
-    files = [gaussian_of(folder), extended_of(folder)]
+    return None if folder is None else _hash_with(gaussian_of(folder), folder)
+
+
+def _hash_with(gaussian: Path, folder: Path) -> str:
+    files = [gaussian, extended_of(folder)]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files if f is not None and f.is_file())).hexdigest()
 
 
@@ -127,7 +129,9 @@ def left_over(whole: Path) -> frozenset[str]:
         out.add("gap")
     trained_on = Path(train.get("fit") or "").name
     if trained_on in ("identify", "gap"):
-        stale = trained_on in out or train.get("fit_sha256") != fingerprint(whole / trained_on)
+        folder, known = whole / trained_on, train.get("fit_sha256")
+        # Policies of earlier versions were trained without the nuisances.
+        stale = trained_on in out or known not in (fingerprint(folder), _hash_with(folder / GAUSSIAN, folder))
         out |= {"train"} if stale else set()
     return frozenset(out)
 

@@ -92,7 +92,7 @@ def measured_motion(
         )
     rate = (len(channel.time) - 1) / float(channel.time[-1] - channel.time[0])
     usual = 1 / float(np.median(np.diff(channel.time)))  # a lost sample makes no slow log
-    if max(rate, usual * (1 + 1e-6)) < 2.5 * cutoff:
+    if max(rate, usual * (1 + 1e-6)) < 2.5 * cutoff or rate <= 2 * cutoff:
         raise ValueError(
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"

@@ -10,12 +10,13 @@ import re
 import sys
 import zipfile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import pytest
 
+from droid_jax.recordings import column_map
 from droid_jax.recordings.column_map import (
     ChannelMap,
     ColumnMap,
@@ -29,6 +30,7 @@ from droid_jax.recordings.column_map import (
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.log_files import read_log
 from droid_jax.recordings.recording import Recording, TorqueSide
+from droid_jax.recordings.table_file import open_csv
 from droid_jax.recordings.units import HINGES, SLIDES
 from droid_jax.run import main
 
@@ -661,6 +663,42 @@ def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert main(["convert", str(path), "--stiffness", "20", "30", "--out", str(target)]) == 0
         gains = load_recording(target).gains
         assert gains is not None and gains.stiffness.tolist() == [20.0, 30.0] and gains.damping is None
+
+
+def test_gains_in_a_kept_map_are_not_those_of_the_next_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A map of an earlier version holds some; converted twice, one log gave two recordings."""
+    path, out = log(tmp_path / "a.csv"), tmp_path / "out"
+    write_map(whole(stiffness=[20.0, 20.0], damping=[0.0, 1.0]), out / "old.map.toml")
+    for name in ("a", "b"):
+        assert main(["convert", str(path), "--out", str(out / f"{name}.npz")]) == 0
+        assert load_recording(out / f"{name}.npz").gains is None
+    own = out / "own.map.toml"
+    write_map(whole(stiffness=[20.0, 20.0], damping=[0.0, 1.0]), own)
+    before = own.read_text()
+    assert main(["convert", str(path), "--map", str(own), "--out", str(out / "own.npz")]) == 0
+    assert load_recording(out / "own.npz").gains is not None and own.read_text() == before
+    assert main(["convert", str(path), "--joints", "a=shoulder", "elbow", "--out", str(out / "c.npz")]) == 2
+    assert "is for ROS bags" in capsys.readouterr().err
+
+
+def test_units_on_the_command_line_leave_numbers_of_other_kinds(tmp_path: Path):
+    def restated(entry: dict[str, Any], key: str, kind: str, unit: str) -> Any:
+        return column_map._restated(entry, key, kind, unit)["unit"]
+
+    assert restated({"unit": "counts", "counts_per_turn": 4096}, "command", "angle", "rad") == "counts"
+    assert restated({"unit": ["rad", "percent"]}, "position", "angle", "deg") == ["deg", "percent"]
+    assert restated({"unit": ["s", "ns"]}, "time", "time", "s") == ["s", "ns"]
+    assert restated({"unit": "rad/s"}, "velocity", "angle", "percent") == "rad/s"
+
+
+def test_tables_with_units_below_their_names_and_commas_beside_nan(tmp_path: Path):
+    (tmp_path / "units.csv").write_text("# time,q1,q2\n# s,rad,rad\n0,0.1,0.2\n0.01,0.3,0.4\n")
+    assert [*open_csv(tmp_path / "units.csv").widths] == ["time", "q1", "q2"]
+    (tmp_path / "numbered.csv").write_text("1,2,3\n0,0.1,0.2\n0.01,0.3,0.4\n")
+    assert [*open_csv(tmp_path / "numbered.csv").widths] == ["1", "2", "3"]
+    (tmp_path / "comma.csv").write_text("t;q1\n0,00;0,10\n0,01;NaN\n0,02;0,12\n")
+    values = open_csv(tmp_path / "comma.csv").read("q1")
+    assert np.array_equal(values, [0.1, np.nan, 0.12], equal_nan=True)
 
 
 def test_what_is_known_of_one_log_is_stated_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
