@@ -82,7 +82,7 @@ def single_case(
     from noise and not from another form of it; other motions are for what is test data.
 
     start: [D] where fits begin, fitted to this motion before; the prior's mean unless given.
-    Raises ValueError where the log is too short for its residual's correlation time.
+    Raises ValueError where the log is too short for its residual's correlation time: eight blocks in all are needed.
     """
     config = config or DiscrepancyConfig()
     clock = log.clock
@@ -91,10 +91,10 @@ def single_case(
     noise = noise_of(log, base, effects, end, config, start)
     deviation, length = noise.deviation, noise.block
     train, validation = (
-        with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), deviation, part, config)
+        with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), deviation, part, config, FEWEST_REPEATS // PARTS)
         for which, part in zip(
             ("every other block", "the blocks between"),
-            interleaved(clock, clock[0], end, length, 2, share),
+            interleaved(clock, clock[0], end, length, PARTS, share, FEWEST_REPEATS // PARTS),
             strict=True,
         )
     )
@@ -111,7 +111,12 @@ def single_case(
     base = restrained(base, config.selection.nuisance_bound)
     turns = in_turns([_of_instants(part) for part in (train, validation)])
     both = with_blocks(log, deviation, turns, config)
-    return Case(train, validation, judged, base, tuple(effects), config, both=both)
+    few = train.resampling.units
+    limits = (f"Only {few} blocks train and as many validate: small effects stay hidden.",)
+    return Case(
+        train, validation, judged, base, tuple(effects), config, both=both,
+        limits=limits if few < FEWEST_REPEATS else (),
+    )  # fmt: skip
 
 
 def base_model(case: Case, start: np.ndarray | None = None, progress: Report = None) -> FittedModel:

@@ -392,7 +392,13 @@ def block_length(residuals: np.ndarray, config: BlocksConfig, rate: float = DEFA
 
 
 def interleaved(
-    clock: np.ndarray, first: float, end: float, length: float, parts: int = 1, share: float = 1.0
+    clock: np.ndarray,
+    first: float,
+    end: float,
+    length: float,
+    parts: int = 1,
+    share: float = 1.0,
+    least: int = FEWEST_REPEATS,
 ) -> np.ndarray:
     """[parts, K] block of each instant, from `first` to `end`, for parts that take turns.
 
@@ -403,16 +409,17 @@ def interleaved(
         length: s, of a block at least.
         parts: that take turns, e.g. training and validation.
         share: of the recording that `first` to `end` is.
+        least: blocks that each part must have.
 
     Raises:
-        ValueError: a part would get fewer than FEWEST_REPEATS blocks; it says how long the recording should be.
+        ValueError: a part would get fewer; it says how long the recording should be.
     """
     each = int((end - first) / length) // parts
-    if each < FEWEST_REPEATS:
-        needed = parts * FEWEST_REPEATS * length / share
+    if each < least:
+        needed = parts * least * length / share
         raise ValueError(
             f"{end - first:.3g} s hold {each} blocks of {length:.3g} s for each of {parts} parts; "
-            f"{FEWEST_REPEATS} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
+            f"{least} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
         )
     at = np.floor((clock - first) / (end - first) * parts * each).astype(int)
     inside = (clock >= first) & (clock < end)

@@ -54,6 +54,8 @@ def test_too_short_a_log_says_how_long_it_should_be(share: float, needed: float)
         interleaved(coarse_clock(0.0, 30.0), 0.0, 20.0, 2.0, 2, share)
     clock = coarse_clock(0.0, needed)
     assert interleaved(clock, 0.0, share * needed + 1e-6, 2.0, 2, share).max() == 7
+    with pytest.raises(ValueError, match=f"4 are needed .* record for {needed / 2:g} s"):
+        interleaved(coarse_clock(0.0, 12.0), 0.0, 12.0, 2.0, 2, share, 4)
 
 
 def test_what_is_not_tested_has_as_few_blocks_as_there_may_be():
