@@ -24,6 +24,7 @@ from droid_jax.identify.extended_model import Extended, save_extended
 from droid_jax.identify.holdout import distance_unit, unit_of
 from droid_jax.identify.identifiability import posterior
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
+from droid_jax.model.parameters import Parameter
 from droid_jax.storage import config_json, finite, write_json, write_npz
 
 FORMAT, VERSION = "droid_jax gap", GAP_VERSION
@@ -285,15 +286,23 @@ def _parameters(
         {
             "name": name,
             "unit": case.full_space[name].unit,
-            "value": float(model.values[case.full_space.index(name)]),
+            "value": (value := float(model.values[case.full_space.index(name)])),
             "low": spans[name][0],
             "high": spans[name][1],
-            "bound": bound_at(case.train, model, name),
+            "bound": _reached(case.full_space[name], value, spans[name], bound_at(case.train, model, name)),
             **_key(part.key),
             "what": what[part.effect],
         }
         for name, part in first.items()
     ]
+
+
+def _reached(parameter: Parameter, value: float, span: tuple[float, float], side: str) -> str:
+    """The bound that a value is near, where it or its interval reaches it: a hundredth of a wide range may be far."""
+    near = 1e-4 * (parameter.high - parameter.low)
+    if side == "lower":
+        return side if min(value, span[0]) <= parameter.low + near else ""
+    return side if max(value, span[1]) >= parameter.high - near else ""
 
 
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:

@@ -13,10 +13,11 @@ from small_gap import FLOOR, JOINTS, PRELOAD, Small, small
 
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.results import FORMAT, VERSION, gap_arrays, gap_json, write_gap
+from droid_jax.discrepancy.results import FORMAT, VERSION, _reached, gap_arrays, gap_json, write_gap
 from droid_jax.discrepancy.verdict import Conclusion, Experiment, unnamed
 from droid_jax.files import GAP, GAP_TRACES
 from droid_jax.model.effects.candidate import EffectKey
+from droid_jax.model.parameters import Parameter
 from droid_jax.recordings.split import ROLES
 from droid_jax.report.gap_folder import largest_shifts, read_gap
 
@@ -295,3 +296,12 @@ def test_it_is_written_whole_or_not_at_all(found: Small, tmp_path: Path):
         write_gap(tmp_path, found.case, found.verdict, found.own, {"seconds": float("nan")})
     written = ["apply_fit.py", "extended.json", "extended.xml", "fitted.json", "gap.npz", "mjlab_terms.py"]
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".patch") == written
+
+
+def test_a_value_near_a_bound_is_at_it_only_where_it_may_be_there():
+    """Dry friction of 0.0496 N m in a range up to 5 was called at its lower bound, with an interval far from it."""
+    p = Parameter("friction", "N m", 0.0, 0.3, 0.0, 5.0)
+    assert _reached(p, 0.0496, (0.0465, 0.0526), "lower") == ""
+    assert _reached(p, 0.0496, (0.0, 0.1), "lower") == _reached(p, 0.0, (0.003, 0.1), "lower") == "lower"
+    assert _reached(p, 4.98, (4.9, 5.0), "upper") == _reached(p, 5.0, (4.9, 4.99), "upper") == "upper"
+    assert _reached(p, 2.0, (1.0, 3.0), "") == ""
