@@ -259,7 +259,7 @@ def check_friction_rows(scene: Scene, space: Space, effects: Sequence[Effect]) -
             )
 
 
-def without_idle(space: Space, recordings: Sequence[Recording]) -> Space:
+def without_unused(space: Space, recordings: Sequence[Recording]) -> Space:
     """The space less parameters that stand for others where none of these recordings says so."""
     named = {value for recording in recordings for value in recording.known.values()}
     return Space(tuple(p for p in space.parameters if p.role is not Role.STANDS_FOR or p.name in named))

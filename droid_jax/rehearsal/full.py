@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.cost.cost import without_idle
+from droid_jax.cost.cost import without_unused
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import with_finer_step
@@ -252,7 +252,7 @@ def _rehearse(of: FullRehearsal, case: HiddenCase, replays: Path) -> dict[str, A
 
 def judged_parameters(of: FullRehearsal, logs: Sequence[Recording], values: np.ndarray) -> list[dict[str, Any]]:
     """Of every parameter of interest: whether an identification recovers it, and whether its interval holds."""
-    space = without_idle(of.space, logs[:1])
+    space = without_unused(of.space, logs[:1])
     main = space.select([p.name for p in space.parameters if not p.nuisance])
     names = [p.name for p in space.parameters if p.nuisance]
     config = replace(of.identify, channels=of.channels)

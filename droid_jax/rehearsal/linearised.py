@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from droid_jax.cost.channels import SIMULATED
-from droid_jax.cost.cost import Cost, make_cost, without_idle
+from droid_jax.cost.cost import Cost, make_cost, without_unused
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
@@ -92,7 +92,7 @@ def rehearsed(
     """
     clock = Stopwatch(tell)
     clock("compile")
-    space = without_idle(space, recordings[:1] if train_only else recordings)
+    space = without_unused(space, recordings[:1] if train_only else recordings)
     effects = beside(space, effects)
     start = space.values(dict(plan.values or {}))
     whole = joined(space, effects)
