@@ -268,7 +268,7 @@ def conclude(
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
-        doubts=(*doubts(case.train, model, case.natural_bounds), *worse_on_test(discrepancies, model)),
+        doubts=(*doubts(case.train, model, case.natural_bounds), *worsened(discrepancies, model, config)),
     )
     return unnamed(case, verdict) if closes_too_little(verdict) else verdict
 
@@ -318,10 +318,14 @@ def _discrepancies(
     return found, ()
 
 
-def worse_on_test(discrepancies: Mapping[str, tuple[float, float]], model: FittedModel) -> tuple[str, ...]:
-    """A doubt where the test recording is matched worse with the effects than without: they do not carry over to it."""
+def worsened(
+    discrepancies: Mapping[str, tuple[float, float]], model: FittedModel, config: SelectionConfig
+) -> tuple[str, ...]:
+    """A doubt where the test recording is matched clearly worse with the effects than without, by the share that a
+    first effect has to gain: they do not carry over to it.
+    """
     before, after = discrepancies.get("test", (0.0, 0.0))
-    if not model.parts or after <= before:
+    if not model.parts or after <= (1 + config.least_gain) * max(before, 0.0):
         return ()
     return (f"the test recording is matched worse with it, U {before:.3g} before and {after:.3g} after",)
 

@@ -12,12 +12,13 @@ from small_gap import FLOOR, Small, problem_of, small
 
 from droid_jax.discrepancy import search
 from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import FittedModel, remaining_discrepancy
 from droid_jax.discrepancy.results import gap_json
 from droid_jax.discrepancy.search import Notes, SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
-from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worse_on_test
+from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worsened
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 
@@ -333,7 +334,8 @@ def test_a_test_recording_that_is_matched_worse_is_a_doubt(found: Small):
     """Friction fitted at low gains let a servo stick at a higher one, and the verdict did not say so."""
     model = found.verdict.model
     assert model.parts and found.verdict.doubts == ()
-    assert worse_on_test({"test": (1.0, 0.9)}, model) == worse_on_test({"validation": (0.1, 0.2)}, model) == ()
-    assert worse_on_test({"test": (0.1, 0.2)}, replace(model, parts=())) == ()
-    (said,) = worse_on_test({"test": (0.1155, 1.0168)}, model)
+    config = SelectionConfig()
+    assert worsened({"test": (1.0, 1.1)}, model, config) == worsened({"validation": (0.1, 0.2)}, model, config) == ()
+    assert worsened({"test": (0.1, 0.2)}, replace(model, parts=()), config) == ()
+    (said,) = worsened({"test": (0.1155, 1.0168)}, model, config)
     assert said == "the test recording is matched worse with it, U 0.116 before and 1.02 after"
