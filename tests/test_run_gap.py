@@ -381,7 +381,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A case compiled already, of small budgets; no replays at a quarter of the time step, and no page."""
     monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
     monkeypatch.setattr(log_case, "make_case", lambda *arguments, **roles: small().case)
-    monkeypatch.setattr(missing, "with_step_difference", lambda train, *_: train)
+    monkeypatch.setattr(missing, "with_step_differences", lambda case, *_: case)
     monkeypatch.setattr(missing, "discretisation_error", lambda *arguments: FLOOR)
     monkeypatch.setattr(page, "write_report", lambda folder: folder / "report.html")
 

@@ -429,7 +429,8 @@ def test_blocks_are_whole_windows_that_take_turns():
         (30, 20, 3.0, [8, 8, 8], ["Blocks of 1.2 s are shorter than the 3 s"]),
         (23, 15, 1.0, [8, 8, 7], []),
         (18, 12, 1.0, [8, 8], ["too short to keep a part of it as test data"]),
-        (9, 6, 0.5, [4, 4], ["too short to keep", "Only 4 blocks are in each part", "no effect can be told"]),
+        (9, 6, 0.5, [4, 4], ["too short to keep"]),
+        (6, 4, 0.5, [3, 3], ["too short to keep", "Only 6 blocks train and validate", "can be told from chance"]),
     ],
 )
 def test_a_short_log_gives_up_one_thing_after_the_other(
