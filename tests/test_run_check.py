@@ -171,7 +171,7 @@ def test_a_motion_that_is_proposed_several_times_is_said_once():
     assert proposal.sentence == "To tell mass, record besides 2 times a slow ramp, steps: 18 s."
 
 
-def untold(scene: Scene) -> tuple[Space, Excitation]:
+def with_open_parameters(scene: Scene) -> tuple[Space, Excitation]:
     """Damping of the arm's joints, of which nothing is known."""
     space = Space(tuple(joint_damping(scene, j, std=1.0, high=20.0) for j in JOINTS))
     config, none = ExcitationConfig(), np.zeros((2, 2))
@@ -182,7 +182,7 @@ def untold(scene: Scene) -> tuple[Space, Excitation]:
 def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
     """A hand was said to hold an object in any case; a replay that failed took all that was found with it."""
     servos = arm()
-    space, found = untold(servos)
+    space, found = with_open_parameters(servos)
     spec = servos.spec.copy()
     for actuator in spec.actuators:
         actuator.biasprm[1] = 0.0

@@ -149,7 +149,7 @@ def run(command: Convert) -> None:
 
 def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     """The recording in logs with a column map, and what keeps that map for the next log."""
-    from msgspec.structs import replace
+    import msgspec
 
     from droid_jax.recordings.column_map import check_map_target, map_beside, write_map
     from droid_jax.recordings.log_files import read_log
@@ -184,7 +184,7 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     def keep() -> None:
         if command.map is not None and command.map.resolve() == beside.resolve():
             return  # the user's own
-        write_map(replace(columns, stiffness=[], damping=[]), beside)  # gains are changed between logs
+        write_map(msgspec.structs.replace(columns, stiffness=[], damping=[]), beside)  # gains are changed between logs
         print(f"the next log of this kind needs no options while {beside} is there")
         if columns.stiffness:
             print("but its own --stiffness and --damping: servo gains are of one log, and the map does not keep them")

@@ -235,8 +235,8 @@ def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
 
 def check_known(space: Space, recordings: Sequence[Recording]) -> None:
     """Raise ValueError for parameters that stand for others where no fitted recording says so: nothing fits them."""
-    named = {value for recording in recordings for value in recording.known.values()}
-    if idle := [p.name for p in space.parameters if p.role is Role.STANDS_FOR and p.name not in named]:
+    kept = without_unused(space, recordings).names
+    if idle := [name for name in space.names if name not in kept]:
         raise ValueError(
             f"parameters {', '.join(idle)} stand for others in recordings that say so, and no fitted one does: state "
             f"it there (`known`, or convert --known PARAMETER={idle[0]}), or leave them out"

@@ -34,7 +34,6 @@ from droid_jax.simulate.replay import Drive
 FINER = 4  # parts of a time step
 # The step's whole U over U0, of an error that falls no faster than the step: what `beyond_step_error` allows for.
 WORST = (FINER / (FINER - 1)) ** 2
-SLOPES = RefineConfig(iterations=0, basin_hops=0)  # at the model's own values, and no step
 SHORTEST_STEP = 0.25  # share of a step that bounds must leave for a slope
 LONGEST_STEP = 1.0  # search units: what the fit did not constrain at all is no further from it than that
 
@@ -354,27 +353,47 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
     return replace(residual_set, step_difference=off)
 
 
-def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
-    """A model that was fitted elsewhere, with its slopes in another residual set and what the base leaves there."""
-    full = residual_set.cost.space
+def model_at(
+    residual_set: ResidualSet, space: Space, values: np.ndarray, parts: Sequence[Candidate] = (), spreads: int = 1
+) -> tuple[FittedModel, np.ndarray]:
+    """A model at known values [D], with the slopes that a fit has; and [M, F] slopes along each axis of its space.
+
+    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
+    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
+    may absorb of an effect shows in the steps along one axis.
+
+    spreads: see `LevenbergMarquardtConfig.spreads`.
+    """
+    whole, config = residual_set.cost.space, RefineConfig(iterations=0, basin_hops=0, spreads=spreads)
 
     def residuals(rows: np.ndarray) -> np.ndarray:
-        return residual_set.whitened(full.embed(model.space, rows, model.values))
+        return residual_set.whitened(whole.embed(space, rows, values))
 
-    problem = DampedProblem(residuals, model.space, SLOPES)
-    state, slopes = problem.start_with_slopes(problem.inside(model.refined.x[None]))
+    problem = DampedProblem(residuals, space, config)
+    state, slopes = problem.start_with_slopes(problem.inside(space.to_search(values[None, whole.columns(space)])))
     if not np.isfinite(state.objective[0]):
-        raise NotReplayed(f"the simulation of {residual_set.comparison.name!r} blows up")
-    refined = replace(
-        model.refined, residual=state.residual[0], jacobian=problem.wide_jacobian(state, slopes[0]),
-        objective=float(state.objective[0]), prior=problem.prior,
+        name = residual_set.comparison.name
+        raise NotReplayed(f"the simulation of {name!r} blows up at the parameters' values: begin at other ones")
+    x = state.x[0]
+    refined = Refined(
+        space, x, space.from_search(x), float(state.objective[0]), state.residual[0],
+        problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
     )  # fmt: skip
-    root, free = np.sqrt(residual_set.repeats), refined.free
+    rows = residual_set.resampling
+    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    at = whole.embed(space, refined.best[None], values)[0]
+    return FittedModel(tuple(parts), at, space, refined, left, rows.discrepancy(left)), slopes[0]
+
+
+def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
+    """A model that was fitted elsewhere, with its slopes in another residual set and what the base leaves there."""
+    here, _ = model_at(residual_set, model.space, model.values, model.parts, RefineConfig().spreads)
+    root, free = np.sqrt(residual_set.repeats), here.refined.free
     # What other instants than the fitted ones ask of the base is in the residuals, and no flip knows it: taken out.
-    held = refined.prior[free] * root * residual_set.prior_slack
-    common = project(-refined.residual[None] / root, refined.jacobian[:, free] / root, held)[0]
+    held = here.refined.prior[free] * root * residual_set.prior_slack
+    common = project(here.residuals.mean(axis=0)[None], here.refined.jacobian[:, free] / root, held)[0]
     left = residual_set.resampling.residuals(common)
-    return replace(model, refined=refined, residuals=left, discrepancy=residual_set.resampling.discrepancy(left))
+    return replace(here, residuals=left, discrepancy=residual_set.resampling.discrepancy(left))
 
 
 def discretisation_error(residual_set: ResidualSet, model: FittedModel) -> float:

@@ -90,13 +90,10 @@ def single_case(
     end = clock[-1] + 1e-6 if test is not None else clock[0] + share * (clock[-1] - clock[0])
     noise = noise_of(log, base, effects, end, config, start)
     deviation, length = noise.deviation, noise.block
+    blocks = interleaved(clock, clock[0], end, length, PARTS, share, FEWEST_REPEATS // PARTS)
     train, validation = (
         with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), deviation, part, config, FEWEST_REPEATS // PARTS)
-        for which, part in zip(
-            ("every other block", "the blocks between"),
-            interleaved(clock, clock[0], end, length, PARTS, share, FEWEST_REPEATS // PARTS),
-            strict=True,
-        )
+        for which, part in zip(("every other block", "the blocks between"), blocks, strict=True)
     )
     own = [] if test is None else per_recording_nuisances(base)  # another day's; the rest of the same log has the same
     rest = log.part(f"{log.comparisons[0].name}, last third") if test is None else test
@@ -109,8 +106,7 @@ def single_case(
     if own:
         judged = judged.with_nuisances(own)
     base = restrained(base, config.selection.nuisance_bound)
-    turns = in_turns([_of_instants(part) for part in (train, validation)])
-    both = with_blocks(log, deviation, turns, config)
+    both = with_blocks(log, deviation, in_turns(list(blocks)), config)
     few = train.resampling.units
     limits = (f"Only {few} blocks train and as many validate: small effects stay hidden.",)
     return Case(
@@ -261,11 +257,6 @@ def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: Dis
         left = left - taken @ (taken.T @ left)
         found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
     return left
-
-
-def _of_instants(residual_set: ResidualSet) -> np.ndarray:
-    """[K] block of each instant of a log."""
-    return residual_set.resampling.block[residual_set.column == 0]  # type: ignore[attr-defined]
 
 
 def with_blocks(
@@ -513,8 +504,8 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
         )
     if PARTS * each < FEWEST_REPEATS:
         limits.append(
-            f"Only {PARTS * each} blocks train and validate, and with fewer than {FEWEST_REPEATS} no effect can be "
-            "told from chance, whatever its size: what the score test ranks first is a hint at most. Record for longer."
+            f"Only {PARTS * each} blocks train and validate, and with fewer than {FEWEST_REPEATS} no effect stands "
+            "out from chance, whatever its size: what the score test ranks first is a hint at most. Record for longer."
         )
     turns = _in_groups(log.unit, 0, fitted, PARTS * each)
     blocks = [np.where((turns != OUTSIDE) & (turns % PARTS == p), turns // PARTS, OUTSIDE) for p in range(PARTS)]

@@ -43,7 +43,7 @@ def check_tracking(scene: Scene, recording: Recording, motion: LogMotion) -> lis
 
 
 def _wrapped(scene: Scene, recording: Recording, motion: LogMotion, where: str) -> dict[str, Finding]:
-    """Joint -> what is said of a hinge whose measured or commanded angle begins anew after each turn."""
+    """Joint -> what is said of a hinge whose measured or commanded angle starts over after each turn."""
     hinges = [j for j in scene.single_joints if not scene.slides(j)]
     tracks = list[tuple[str, str, np.ndarray, np.ndarray]]()
     if channel := recording.channels.get("position"):

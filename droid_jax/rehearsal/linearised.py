@@ -19,10 +19,8 @@ from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, until, with_finer_step, with_step_difference
+from droid_jax.discrepancy.fitting import FittedModel, model_at, until, with_finer_step, with_step_difference
 from droid_jax.discrepancy.log_case import base_model, case_of, least_residual, refitted_residual
-from droid_jax.identify.levenberg_marquardt import DampedProblem
-from droid_jax.identify.multistart import RefineConfig, Refined
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import candidates
@@ -35,7 +33,6 @@ from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig
 from droid_jax.rehearsal.plan import ColumnNoise, RehearsalPlan, noise_of_log, planned_recording, simulated_channels
 from droid_jax.simulate.replay import Drive
 
-AT_REST = RefineConfig(iterations=0, basin_hops=0)  # slopes at the known parameters, and no step
 ROUGHLY = 5  # iterations of a base fit whose residual is taken for noise
 FINE = (8, 32)  # parts of a time step
 Tell = Callable[[str], None]
@@ -118,7 +115,7 @@ def rehearsed(
         base = base_model(case)
         values, slopes = base.values, base.refined.jacobian
     else:
-        base, slopes = known_base(case.train, case.base, values)
+        base, slopes = model_at(case.train, case.base, values)
     clock("sensitivities")
     directions = directions_of(candidates(case.effects))
     if train_only:
@@ -127,7 +124,7 @@ def rehearsed(
     train = part_of(case.train, base, slopes[:, free], directions)
     validation = train
     if split is not Split.REPEATS and not train_only:
-        beside_base, slopes = known_base(case.validation, case.base, values, spreads=0)
+        beside_base, slopes = model_at(case.validation, case.base, values, spreads=0)
         validation = part_of(case.validation, beside_base, slopes[:, free], directions)
     if not train.rows.repeated:
         share = unexplained_share(case, base, train, directions)
@@ -165,38 +162,6 @@ def clean_channels(
         return simulated_channels(ready(scene), whole, effects, recording, at, config)
 
     return simulated
-
-
-def known_base(
-    residual_set: ResidualSet, base: Space, values: np.ndarray, spreads: int = 1
-) -> tuple[FittedModel, np.ndarray]:
-    """The base model at known values [D], with the slopes that a fit has; and [M, D] slopes along each axis.
-
-    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
-    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
-    may absorb of an effect shows in the steps along one axis.
-
-    spreads: see `LevenbergMarquardtConfig.spreads`.
-    """
-    whole, config = residual_set.cost.space, replace(AT_REST, spreads=spreads)
-
-    def residuals(rows: np.ndarray) -> np.ndarray:
-        return residual_set.whitened(whole.embed(base, rows, values))
-
-    problem = DampedProblem(residuals, base, config)
-    state, slopes = problem.start_with_slopes(problem.inside(base.to_search(values[None, whole.columns(base)])))
-    if not np.isfinite(state.objective[0]):
-        name = residual_set.comparison.name
-        raise NotReplayed(f"the simulation of {name!r} blows up at the parameters' values: begin at other ones")
-    x = state.x[0]
-    refined = Refined(
-        base, x, base.from_search(x), float(state.objective[0]), state.residual[0],
-        problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
-    )  # fmt: skip
-    rows = residual_set.resampling
-    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
-    at = whole.embed(base, refined.best[None], values)[0]
-    return FittedModel((), at, base, refined, left, rows.discrepancy(left)), slopes[0]
 
 
 def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recording: Recording) -> np.ndarray | None:

@@ -57,15 +57,15 @@ def start_pose(scene: Scene, recording: Recording, config: StartConfig = DEFAULT
             scene.qpos(joint)
         except ValueError as error:
             raise ValueError(f"recording {recording.name!r}, qpos0: {error}") from None
-    told = _stated(scene, recording, config)
+    stated = _stated(scene, recording, config)
     asked = {*scene.needs_command, *recording.command_names}
-    guessed = [j for j in scene.driven_joints if j in asked and j not in told]
+    guessed = [j for j in scene.driven_joints if j in asked and j not in stated]
     if guessed:
         raise ValueError(
             f"recording {recording.name!r} does not tell where {', '.join(guessed)} starts: state it in qpos0 "
             "or measure its position"
         )
-    qpos = closed(scene, _coupled(scene, told), [scene.qpos(joint) for joint in told])
+    qpos = closed(scene, _coupled(scene, stated), [scene.qpos(joint) for joint in stated])
     if wide := [loop for loop in open_loops(scene, qpos) if loop.turn > OPEN]:
         raise ValueError(
             f"recording {recording.name!r} starts where {wide[0].name} of scene {scene.name!r} is open by "
@@ -86,13 +86,13 @@ def _stated(scene: Scene, recording: Recording, config: StartConfig) -> dict[str
     return {**sent, **_measured(scene, recording, config.ajar), **recording.qpos0}
 
 
-def _coupled(scene: Scene, told: Mapping[str, float]) -> np.ndarray:
+def _coupled(scene: Scene, stated: Mapping[str, float]) -> np.ndarray:
     """[nq] the scene's pose with these joints in it, and those that equalities couple to them where these have them.
 
     q1 - q1_0 = polynomial of q2 - q2_0 (MuJoCo's <equality><joint>); from q1 to q2 where the polynomial is a line.
     """
-    model, known = scene.model, {scene.qpos(joint): q for joint, q in told.items()}
-    qpos = scene.initial_qpos(told)
+    model, known = scene.model, {scene.qpos(joint): q for joint, q in stated.items()}
+    qpos = scene.initial_qpos(stated)
     couplings = _couplings(model)
     for _ in couplings:  # in a chain each needs the one before
         for first, second, c in couplings:

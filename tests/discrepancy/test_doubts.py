@@ -52,8 +52,11 @@ def test_a_shape_that_is_poorly_constrained_says_nothing_of_the_form(found: Smal
     train, model, p = found.case.train, shaped(found, -1.0), found.case.full_space[SHAPE]
     share = np.ptp(intervals(train, model, [SHAPE])[SHAPE]) / (p.high - p.low)
     assert share < train.config.shape_interval_share
-    for told, said in ((0.9 * share, 0), (1.1 * share, 1)):
-        assert len(doubts(replace(train, config=replace(train.config, shape_interval_share=told)), model)) == said
+    for interval_share, said in ((0.9 * share, 0), (1.1 * share, 1)):
+        assert (
+            len(doubts(replace(train, config=replace(train.config, shape_interval_share=interval_share)), model))
+            == said
+        )
 
 
 def test_a_coefficient_past_its_bound_is_larger_than_its_bounds_allow(found: Small):

@@ -430,7 +430,13 @@ def test_blocks_are_whole_windows_that_take_turns():
         (23, 15, 1.0, [8, 8, 7], []),
         (18, 12, 1.0, [8, 8], ["too short to keep a part of it as test data"]),
         (9, 6, 0.5, [4, 4], ["too short to keep"]),
-        (6, 4, 0.5, [3, 3], ["too short to keep", "Only 6 blocks train and validate", "can be told from chance"]),
+        (
+            6,
+            4,
+            0.5,
+            [3, 3],
+            ["too short to keep", "Only 6 blocks train and validate", "no effect stands out from chance"],
+        ),
     ],
 )
 def test_a_short_log_gives_up_one_thing_after_the_other(

@@ -477,7 +477,7 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
 
 
 def test_a_cost_keeps_its_steps(scene: Scene):
-    """Against another config, mj_step was not what had been asked for, and nobody was told."""
+    """Against another config, mj_step was silently not what had been asked for."""
     cost = make_cost(scene, SPACE, recording(), config=CompareConfig(mj_step=True))
     with pytest.raises(ValueError, match="compiled with another mj_step"):
         cost.against([recording()], CompareConfig())
