@@ -1,7 +1,7 @@
 """Levenberg-Marquardt in batches: one iteration of several starts at once, in search coordinates.
 
-An iteration is one batch of central differences, then batches of trial steps with that Jacobian for as long as they
-pay.  A trial differs from the next in its damping, its length and its path: straight in search coordinates, or straight
+An iteration is one batch of central differences, then batches of trial steps for as long as they pay.  Each of them
+corrects the Jacobian by what the trials before it have shown (`secant_slopes`).  A trial differs from the next in its damping, its length and its path: straight in search coordinates, or straight
 in physical units.  Residuals are close to linear in masses, springs and damping, whose search coordinate is their
 logarithm; where two of them trade with each other (door and knob turn about the same hinge), the valley between them is
 straight in physical units alone.
@@ -33,8 +33,10 @@ class LevenbergMarquardtConfig:
     longest_step: largest component of a candidate step, search units: further off the slopes no longer hold.
     least_ratio: a path that is straight in physical units takes a parameter to no less than this share of itself.
     main_prior: prior deviation of parameters of interest, search units.
-    chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
-    chords: batches of trials at most with one Jacobian.
+    chord: without new differences, a Jacobian serves another batch of trials while the last lowered the objective by
+      this share.
+    chords: batches of trials at most between two batches of differences.
+    secant_ridge: of the correction of a Jacobian by trials; limits what two nearly parallel steps may ask for.
     dampings: factors on the last damping that a batch of trials tries; with lengths and both paths 32 trials, the block
       of a CPU in MJX.
     lengths: shares of the whole step that it tries.
@@ -49,7 +51,8 @@ class LevenbergMarquardtConfig:
     least_ratio: float = 0.05
     main_prior: float = 4.0
     chord: float = 0.03
-    chords: int = 3
+    chords: int = 6
+    secant_ridge: float = 0.01
     dampings: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3, 1e4)
     lengths: tuple[float, ...] = (1.0, 0.5)
     spreads: int = 2
@@ -69,6 +72,7 @@ class LevenbergMarquardtConfig:
             least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
             chords=partial(whole, least=1),
+            secant_ridge=partial(number, above=0),
             dampings=several(partial(number, above=0)),
             lengths=several(partial(number, above=0, most=1)),
             spreads=partial(whole, least=0),
@@ -88,6 +92,13 @@ class Starts:
     def rows(self, keep: Any) -> Starts:
         """The starts that `keep` indexes."""
         return Starts(*(getattr(self, f)[keep] for f in Starts.__dataclass_fields__))
+
+    def with_rows(self, at: np.ndarray, others: Starts) -> Starts:
+        """These starts, and at the rows [N] `at` the others."""
+        out = self.rows(np.arange(len(self.x)))
+        for field in Starts.__dataclass_fields__:
+            getattr(out, field)[at] = getattr(others, field)
+        return out
 
 
 def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -132,6 +143,35 @@ def damped_steps(
         step *= min(1.0, longest / max(np.max(np.abs(step), initial=0.0), 1e-12))
         out[k][:, free] = np.outer(lengths, step)
     return out.reshape(-1, len(slope))
+
+
+def secant_slopes(
+    jacobian: np.ndarray, prior: np.ndarray, steps: np.ndarray, changes: np.ndarray, ridge: float
+) -> np.ndarray:
+    """Slopes [M, D] that agree with known differences, and change as little from `jacobian` as that allows.
+
+    Broyden's update (1965) for several differences at once.  How little is counted in units of each parameter's own
+    deviation, so that sharp parameters are not changed more than others.  Short steps count more: the longer a step,
+    the more of its difference is curvature.
+
+    Args:
+        jacobian: [M, D].
+        prior: [D] prior deviations.
+        steps: [N, D] from where the slopes are wanted.
+        changes: [N, M] of the residuals; NaN where a replay failed.
+        ridge: share of the shortest step's weight that is noise.
+    """
+    scale = np.sqrt(np.einsum("md,md->d", jacobian, jacobian) + prior**-2)
+    length = np.linalg.norm(steps * scale, axis=1)
+    known = np.isfinite(changes).all(axis=1) & (length > 0)
+    if not known.any():
+        return jacobian
+    steps, changes, length = steps[known], changes[known], length[known]
+    weight = np.min(length) / length**2
+    ways = steps * scale * weight[:, None]
+    wanted = (changes - steps @ jacobian.T) * weight[:, None]
+    change = ways.T @ np.linalg.solve(ways @ ways.T + ridge * np.eye(len(ways)), wanted)
+    return jacobian + change.T * scale
 
 
 def principal_axes(cov: np.ndarray, longest: float) -> np.ndarray:
@@ -224,13 +264,30 @@ class DampedProblem:
         return replace(state, widths=widths), fall(before, state.objective)
 
     def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
-        """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
-        for _ in range(self._config.chords):
-            last, trials = state, self.trials(state, jacobian, held)
+        """Batches of trials from a Jacobian [S, M, D], for as long as they pay.
+
+        Of each start another batch pays while the last one lowered its objective by as much, for its replays, as the
+        first one did for its own and those of the differences.
+        """
+        replays = self._config.trials, self._config.trials + 2 * len(self.space)
+        going, first, jacobian = np.arange(len(state.x)), np.zeros(len(state.x)), jacobian.copy()
+        for number in range(self._config.chords):
+            last = state.rows(going)
+            trials = self.trials(last, jacobian[going], None if held is None else held[going])
             residual = self.replay(trials.reshape(-1, trials.shape[-1])).reshape(*trials.shape[:2], -1)
-            state = self.taken(state, trials, residual)
-            if not self.paid(last, state):
+            now = self.taken(last, trials, residual)
+            state, fell = state.with_rows(going, now), fall(last.objective, now.objective)
+            first = first if number else fell
+            pays = (fell > 0) & (fell * replays[1] >= first[going] * replays[0])
+            if not pays.any():
                 break
+            for k in np.flatnonzero(pays):
+                points, seen = np.vstack([last.x[k], trials[k]]), np.vstack([last.residual[k], residual[k]])
+                slopes, ridge = jacobian[going[k]], self._config.secant_ridge
+                jacobian[going[k]] = secant_slopes(
+                    slopes, self.prior, points - now.x[k], seen - now.residual[k], ridge
+                )
+            going = going[pays]
         return state
 
     def jacobian(self, state: Starts) -> np.ndarray:

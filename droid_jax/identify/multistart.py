@@ -33,6 +33,7 @@ from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
 
+EXPLORED = 2  # iterations that a hypothesis is ahead of a start in `RefineConfig.pruning_ratio`: all else is fitted
 AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
 
 
@@ -51,6 +52,8 @@ class RefineConfig(LevenbergMarquardtConfig):
     give_up: iterations like the last.
     pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective go on (the last
       number holds from there on).
+    same_basin: of two starts whose replays differ by less than this share of what the better one leaves beyond noise,
+      only that one goes on: they would end at the same values.
     misfit_threshold: hypotheses are tried where the residuals' mean square stays above this.
     hold_iterations: iterations for which the values of a hypothesis are held while all else settles.
     followed: hypotheses that go on once all else has settled a little, the best ones.
@@ -75,6 +78,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     target_objective: float = np.inf
     give_up: float = 30.0
     pruning_ratio: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
+    same_basin: float = 0.1
     misfit_threshold: float = 1.1
     hold_iterations: int = 2
     followed: int = 2
@@ -104,6 +108,7 @@ class RefineConfig(LevenbergMarquardtConfig):
             **dict.fromkeys(("give_up", "basin_hop_sigma", "basin_hop_longest"), partial(arguments.number, above=0)),
             target_objective=partial(arguments.number, infinite=True),
             pruning_ratio=several(partial(arguments.number, least=1)),
+            same_basin=partial(arguments.number, least=0),
             misfit_threshold=partial(arguments.number, least=0),
             basin_hop_misfit=partial(arguments.number, above=0, infinite=True),
             hold_iterations=partial(whole, least=0),
@@ -304,8 +309,14 @@ class _Descent(DampedProblem):
             if self.given_up:
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
+            good &= self.apart(state, state.rows([leader])) | (np.arange(len(state.x)) == leader)
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), ended
+
+    def apart(self, state: Starts, other: Starts) -> np.ndarray:
+        """[S] bool, whether starts replay otherwise than another one [1], which is no worse than they are."""
+        between = 0.5 * np.sum((state.residual - other.residual) ** 2, axis=1)
+        return between > max(self.config.tolerance, self.config.same_basin * float(self.excess(other)[0]))
 
     def back(self, state: Starts) -> Starts:
         """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
@@ -394,7 +405,8 @@ class _Descent(DampedProblem):
     def explore(self, state: Starts, hypotheses: Hypotheses) -> Starts:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
-        After one iteration only the best of them go on.  Returns the better of what they found and `state`, one start.
+        After each iteration only the best of them go on, and of these only those that come near `state`, one start.
+        Returns the better of what they found and `state`.
         """
         x = np.repeat(state.x, len(hypotheses), axis=0)
         held = np.zeros(x.shape, bool)
@@ -411,6 +423,13 @@ class _Descent(DampedProblem):
         for iteration in range(self.config.hold_iterations + 1):
             branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
             ahead = np.argsort(branches.objective)[: self.config.followed]
+            ratio = self.config.pruning_ratio[min(iteration + EXPLORED, len(self.config.pruning_ratio) - 1)]
+            if iteration < self.config.hold_iterations:
+                better = branches.objective < state.objective[0]
+                near = branches.objective <= ratio * state.objective[0]
+                ahead = ahead[(better | (near & self.apart(branches, state)))[ahead]]
+            if not len(ahead):
+                return state
             branches, held = branches.rows(ahead), held[ahead]
         found = branches.rows([int(np.argmin(branches.objective))])
         best = found if found.objective[0] < state.objective[0] else state
