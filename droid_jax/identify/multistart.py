@@ -33,7 +33,6 @@ from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
 
-EXPLORED = 2  # iterations that a hypothesis is ahead of a start in `RefineConfig.pruning_ratio`: all else is fitted
 AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
 
 
@@ -405,8 +404,8 @@ class _Descent(DampedProblem):
     def explore(self, state: Starts, hypotheses: Hypotheses) -> Starts:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
-        After each iteration only the best of them go on, and of these only those that come near `state`, one start.
-        Returns the better of what they found and `state`.
+        After each iteration only the best of them go on, and of these only those in another basin than `state`, one
+        start.  Returns the better of what they found and `state`.
         """
         x = np.repeat(state.x, len(hypotheses), axis=0)
         held = np.zeros(x.shape, bool)
@@ -423,11 +422,9 @@ class _Descent(DampedProblem):
         for iteration in range(self.config.hold_iterations + 1):
             branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
             ahead = np.argsort(branches.objective)[: self.config.followed]
-            ratio = self.config.pruning_ratio[min(iteration + EXPLORED, len(self.config.pruning_ratio) - 1)]
-            if iteration < self.config.hold_iterations:
-                better = branches.objective < state.objective[0]
-                near = branches.objective <= ratio * state.objective[0]
-                ahead = ahead[(better | (near & self.apart(branches, state)))[ahead]]
+            if iteration < self.config.hold_iterations:  # what is back in the basin that it left has nothing to find
+                other = (branches.objective < state.objective[0]) | self.apart(branches, state)
+                ahead = ahead[other[ahead]]
             if not len(ahead):
                 return state
             branches, held = branches.rows(ahead), held[ahead]
