@@ -242,18 +242,21 @@ class DampedProblem:
         return Starts(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
 
     def start_with_slopes(self, x: np.ndarray) -> tuple[Starts, np.ndarray]:
-        """`start` of one start [1, D] and its `jacobian` [1, M, D], of one batch of replays."""
+        """`start` of fresh starts [S, D] and their `jacobian` [S, M, D], of one batch of replays."""
         widths = np.full(x.shape, self._config.step)
-        up, down = self._around(x, widths)
-        residual = self.replay(np.concatenate([x, up[0], down[0]]))
-        state = self.begun(x, residual[:1])
-        return state, self._slopes(
-            *self._apart(np.stack([up, down]), residual[1:].reshape(2, *up.shape[:2], -1), state)
-        )
+        points = np.stack(self._around(x, widths))
+        residual = self.replay(np.concatenate([x, points.reshape(-1, x.shape[1])]))
+        state = self.begun(x, residual[: len(x)])
+        return state, self._slopes(*self._apart(points, residual[len(x) :].reshape(*points.shape[:3], -1), state))
 
-    def step(self, state: Starts, held: np.ndarray | None = None) -> tuple[Starts, np.ndarray]:
-        """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
-        jacobian = self.jacobian(state)
+    def step(
+        self, state: Starts, held: np.ndarray | None = None, jacobian: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
+        """One iteration of all starts, and by how much each objective fell.
+
+        held: [S, D] bool, stay put.  jacobian: [S, M, D] where it is known.
+        """
+        jacobian = self.jacobian(state) if jacobian is None else jacobian
         before = state.objective
         self.iterations += 1
         state = self.candidate_steps(state, jacobian, held)

@@ -184,22 +184,22 @@ def refine(
     """
     config = config or RefineConfig()
     rough = _Descent(residuals if first is None else first, space, config, progress)
-    begun = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    begun, slopes = rough.start_with_slopes(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
     ended, alive = begun.objective, np.isfinite(begun.objective)
     if not alive.any():
         raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance)
+    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance, slopes[alive])
     if hypotheses and np.mean(state.residual**2) > config.misfit_threshold:
         state, _ = rough.descend(rough.explore(state, hypotheses), config.coarse_tolerance)
-    problem = rough
+    problem, slopes = rough, None
     if first is not None:
         problem = _Descent(residuals, space, config, progress, rough)
-        state = problem.start(state.x)
+        state, slopes = problem.start_with_slopes(state.x)
         if not np.isfinite(state.objective[0]):
             raise NotReplayed(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
-    state, _ = problem.descend(state)
+    state, _ = problem.descend(state, jacobian=slopes)
     hops = 0 if problem.misses(state) else config.basin_hops
     if hops:
         state = problem.back(state)
@@ -286,15 +286,18 @@ class _Descent(DampedProblem):
         """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
         return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
 
-    def descend(self, state: Starts, rough: float = 0.0) -> tuple[Starts, np.ndarray]:
+    def descend(
+        self, state: Starts, rough: float = 0.0, jacobian: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
         """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
 
-        rough: a share of the objective that is not worth an iteration either.
+        rough: a share of the objective that is not worth an iteration either.  jacobian: [S, M, D] at `state`, where it
+        is known.
         """
         ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
         keep, idle = self.config.pruning_ratio, 0
         for number in range(self.config.iterations - self.iterations):
-            state, gain = self.step(state)
+            state, gain = self.step(state, jacobian=None if number else jacobian)
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
@@ -414,13 +417,14 @@ class _Descent(DampedProblem):
                 column = self.space.index(name)
                 x[row, column] = self.space[name].to_search(value)
                 held[row, column] = True
-        branches = self.start(self.inside(x))
+        branches, slopes = self.start_with_slopes(self.inside(x))
         alive = np.isfinite(branches.objective)
         if not alive.any():
             return state
-        branches, held = branches.rows(alive), held[alive]
+        branches, held, slopes = branches.rows(alive), held[alive], slopes[alive]
         for iteration in range(self.config.hold_iterations + 1):
-            branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
+            still = held if iteration < self.config.hold_iterations else None
+            branches, _ = self.step(branches, still, None if iteration else slopes)
             ahead = np.argsort(branches.objective)[: self.config.followed]
             if iteration < self.config.hold_iterations:  # what is back in the basin that it left has nothing to find
                 other = (branches.objective < state.objective[0]) | self.apart(branches, state)

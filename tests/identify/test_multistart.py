@@ -98,8 +98,8 @@ def test_among_the_first_trials_is_the_whole_way_straight_in_physical_units():
     recorder = Recorder(linear(matrix, matrix @ [3.5, 0.1]))
     space = Space((positive("m1", 3.0), positive("m2", 0.3)))
     refine(recorder, space, [3.0, 0.3], dataclasses.replace(FLAT, step=1e-3))
-    start, differences, first = recorder.asked[:3]
-    assert (len(start), len(differences)) == (1, 4)
+    begun, first = recorder.asked[:2]
+    assert len(begun) == 1 + 4  # the start with its differences
     assert np.min(np.max(np.abs(first / [3.5, 0.1] - 1), axis=1)) < 1e-4
 
 
@@ -227,8 +227,8 @@ def test_starts_far_worse_than_the_best_are_dropped():
     def iterations_of_the_second(keep):
         recorder = Recorder(two_basins)
         refine(recorder, BASINS, starts, dataclasses.replace(FLAT, pruning_ratio=keep))
-        differences = [rows for rows in recorder.asked if len(rows) == 8]  # of two starts; four rows for one
-        return len(differences)
+        # Of two starts, the first time with the starts themselves; four rows for one.
+        return sum(len(rows) in (8, 10) for rows in recorder.asked)
 
     assert iterations_of_the_second((1.0,)) == 1
     assert iterations_of_the_second((1e9, 1e9, 1.0)) == 3
@@ -340,8 +340,8 @@ def test_the_cheap_part_sorts_the_starts_and_all_data_give_the_result():
     fit = refine(full, BASINS, [[3.2, 14.0], [-3.2, -10.0]], FLAT, first=cheap)
     np.testing.assert_allclose(fit.best, [-3.0, -12.0 + 2 / 25], atol=1e-4)
     np.testing.assert_allclose(
-        full.asked[0], [[-3.0, -10.0]], atol=1e-3
-    )  # one row: where the cheap part's winner ended
+        full.asked[0][0], [-3.0, -10.0], atol=1e-3
+    )  # where the cheap part's winner ended, before its differences
     assert np.all(full.rows[:, 0] < 0)
     assert fit.residual.shape == (4,) and fit.jacobian.shape == (4, 2)
 
@@ -366,7 +366,8 @@ def test_a_start_that_fails_is_dropped_while_another_wins():
     fit = refine(recorder, BASINS, [[100.0, 0.0], [0.0, 0.0]], FLAT)
     np.testing.assert_allclose(fit.best, [1.0, 2.0], atol=1e-6)
     assert np.isinf(fit.starts[0]) and fit.starts[1] == pytest.approx(fit.objective, abs=1e-6)
-    assert len(recorder.asked[0]) == 2 and len(recorder.asked[1]) == 4  # both starts, then the differences of one
+    trials = FLAT.trials
+    assert [len(rows) for rows in recorder.asked[:2]] == [2 + 8, trials]  # both with differences, then trials of one
 
 
 def test_a_hypothesis_that_fails_is_dropped_while_another_wins():
