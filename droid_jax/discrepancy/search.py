@@ -56,7 +56,7 @@ from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates, names_of
 
-TOGETHER = 4  # candidates whose first steps share batches: two starts of eight trials each fill two blocks of a CPU
+TOGETHER = 12  # candidates whose first steps share batches: on a CPU a few of them fill no whole block
 Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 
 
@@ -246,10 +246,12 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     begun = SelectionStep(found, model.keys, tuple(ranked))
     promising, notes = _one_step_fits(problem, model, ranked[: config.one_step_fits], found)
     sure, others = promising[: config.sure_refits], promising[config.sure_refits :]
+    target = target_objective(problem, model)
+    others = [look for look in others if not _hopeless(model, look[1], target, config.refit)]
     others = sorted(others, key=lambda look: look[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda look: look[1])[: config.full_refits]
     starters = [((*model.parts, *p.parts), values) for values, _, p in best]
-    tried, more = staged_refit(problem, starters, target_objective(problem, model), "candidates not refitted")
+    tried, more = staged_refit(problem, starters, target, "candidates not refitted")
     notes += more
     done = _decided(problem, model, begun, tried)
     near = _collinear_candidates(done, config.selection.collinear)
@@ -260,6 +262,12 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     what = "candidates collinear with the best not refitted"
     beside, more = staged_refit(problem, starters, aim, what, " (collinear with the best)")
     return _decided(problem, model, begun, [*tried, *beside]), notes + more
+
+
+def _hopeless(model: FittedModel, objective: float, target: float, config: RefineConfig) -> bool:
+    """Whether a candidate that reached `objective` in one step from `model` is out of reach of the target, by the rule
+    that gives up a refit (`RefineConfig.give_up`)."""
+    return config.give_up * (model.refined.objective - objective) < objective - target
 
 
 def _one_step_fits(

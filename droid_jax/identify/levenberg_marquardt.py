@@ -29,7 +29,8 @@ class LevenbergMarquardtConfig:
     """Settings of an iteration.
 
     step: half-width of the first central differences, search units.
-    smallest_step: and of later ones at least, search units (below it solver noise would show).
+    smallest_step: and of later ones at least, search units (below it solver noise would show); trials that are nearer
+      correct no slopes either.
     longest_step: largest component of a candidate step, search units: further off the slopes no longer hold.
     least_ratio: a path that is straight in physical units takes a parameter to no less than this share of itself.
     main_prior: prior deviation of parameters of interest, search units.
@@ -188,6 +189,8 @@ def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 class DampedProblem:
     """Residuals and prior in search coordinates, with what an iteration does; counts iterations and replays.
 
+    It keeps the slopes of the last iteration, corrected to where that ended (`slopes`).
+
     before: a problem whose counts are gone on with.
     """
 
@@ -201,6 +204,7 @@ class DampedProblem:
         self.log_width = np.array([p.log_width if p.scaling is Scaling.LOG else 0.0 for p in space.parameters])
         self.evaluations = before.evaluations if before else 0
         self.iterations = before.iterations if before else 0
+        self._known = np.zeros((0, len(space))), np.zeros((0, 0, len(space)))  # starts [S, D], slopes [S, M, D] there
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """x clipped to the bounds."""
@@ -259,15 +263,18 @@ class DampedProblem:
         jacobian = self.jacobian(state) if jacobian is None else jacobian
         before = state.objective
         self.iterations += 1
-        state = self.candidate_steps(state, jacobian, held)
+        state, jacobian = self.candidate_steps(state, jacobian, held)
+        self._known = state.x, jacobian
         curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self._config.smallest_step, self._config.step)
         return replace(state, widths=widths), fall(before, state.objective)
 
-    def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
-        """Batches of trials from a Jacobian [S, M, D], for as long as they pay.
+    def candidate_steps(
+        self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
+        """Batches of trials from a Jacobian [S, M, D], for as long as they pay; and the slopes where they end.
 
         Of each start another batch pays while the last one lowered its objective by as much, for its replays, as the
         first one did for its own and those of the differences.
@@ -281,21 +288,27 @@ class DampedProblem:
             now = self.taken(last, trials, residual)
             state, fell = state.with_rows(going, now), fall(last.objective, now.objective)
             first = first if number else fell
-            pays = (fell > 0) & (fell * replays[1] >= first[going] * replays[0])
-            if not pays.any():
-                break
-            for k in np.flatnonzero(pays):
+            for k in np.flatnonzero(fell > 0):  # where a start stands still, differences are better than any trial
                 points, seen = np.vstack([last.x[k], trials[k]]), np.vstack([last.residual[k], residual[k]])
-                slopes, ridge = jacobian[going[k]], self._config.secant_ridge
+                steps, changes = points - now.x[k], seen - now.residual[k]
+                wide = np.max(np.abs(steps), axis=1) >= self._config.smallest_step  # solver noise hides in shorter ones
                 jacobian[going[k]] = secant_slopes(
-                    slopes, self.prior, points - now.x[k], seen - now.residual[k], ridge
+                    jacobian[going[k]], self.prior, steps[wide], changes[wide], self._config.secant_ridge
                 )
-            going = going[pays]
-        return state
+            going = going[(fell > 0) & (fell * replays[1] >= first[going] * replays[0])]
+            if not len(going):
+                break
+        return state, jacobian
 
     def jacobian(self, state: Starts) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
         return self._slopes(*self.differences(*self._around(state.x, state.widths), state))
+
+    def slopes(self, state: Starts) -> np.ndarray:
+        """[M, D] slopes of one start: those of the last iteration where it ended there, else differences."""
+        starts, jacobians = self._known
+        at = np.flatnonzero(np.all(starts == state.x, axis=1))
+        return jacobians[at[0]] if len(at) else self.jacobian(state)[0]
 
     def _around(self, x: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[S, D, D] a width up and down of starts [S, D] along each axis, within bounds."""

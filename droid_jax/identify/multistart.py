@@ -71,11 +71,11 @@ class RefineConfig(LevenbergMarquardtConfig):
 
     iterations: int = 30
     tolerance: float = 0.5
-    excess_tolerance: float = 2e-3
+    excess_tolerance: float = 5e-3
     patience: int = 1
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
-    give_up: float = 30.0
+    give_up: float = 5.0
     pruning_ratio: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
     same_basin: float = 0.1
     misfit_threshold: float = 1.1
@@ -190,7 +190,9 @@ def refine(
         raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
     state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance, slopes[alive])
     if hypotheses and np.mean(state.residual**2) > config.misfit_threshold:
-        state, _ = rough.descend(rough.explore(state, hypotheses), config.coarse_tolerance)
+        found = rough.explore(state, hypotheses)
+        if found is not state:
+            state, _ = rough.descend(found, config.coarse_tolerance)
     problem, slopes = rough, None
     if first is not None:
         problem = _Descent(residuals, space, config, progress, rough)
@@ -199,7 +201,8 @@ def refine(
             raise NotReplayed(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
-    state, _ = problem.descend(state, jacobian=slopes)
+    if problem is not rough or not rough.stands_still:
+        state, _ = problem.descend(state, jacobian=slopes)
     hops = 0 if problem.misses(state) else config.basin_hops
     if hops:
         state = problem.back(state)
@@ -210,7 +213,7 @@ def refine(
         best=space.from_search(state.x[0]),
         objective=float(state.objective[0]),
         residual=state.residual[0],
-        jacobian=problem.wide_jacobian(state, problem.jacobian(state)[0] if slopes is None else slopes),
+        jacobian=problem.wide_jacobian(state, problem.slopes(state) if slopes is None else slopes),
         prior=problem.prior,
         starts=ended,
         evaluations=problem.evaluations,
@@ -280,7 +283,7 @@ class _Descent(DampedProblem):
     ) -> None:
         super().__init__(residuals, space, config, before)
         self.config, self.progress = config, progress
-        self.given_up = False
+        self.given_up, self.stands_still = False, False
 
     def excess(self, state: Starts) -> np.ndarray:
         """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
@@ -292,23 +295,27 @@ class _Descent(DampedProblem):
         """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
 
         rough: a share of the objective that is not worth an iteration either.  jacobian: [S, M, D] at `state`, where it
-        is known.
+        is known.  `stands_still` then says whether an iteration without `rough` would pay either.
         """
         ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
-        keep, idle = self.config.pruning_ratio, 0
+        keep, idle, still = self.config.pruning_ratio, 0, 0
         for number in range(self.config.iterations - self.iterations):
             state, gain = self.step(state, jacobian=None if number else jacobian)
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
-            paid = gain[leader] > max(self.least(state), rough * state.objective[leader])
-            idle = 0 if paid else idle + 1
+            least = self.least(state)
+            idle = 0 if gain[leader] > max(least, rough * state.objective[leader]) else idle + 1
+            still = 0 if gain[leader] > least else still + 1
+            # One that found nothing at all may yet with slopes over another width.
+            self.stands_still = still >= self.config.patience and bool(gain[leader] > 0)
             if idle == (1 if rough else self.config.patience):
                 break
             self.given_up = bool(
                 self.config.give_up * gain[leader] < state.objective[leader] - self.config.target_objective
             )
             if self.given_up:
+                self.stands_still = bool(gain[leader] > 0)
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
             good &= self.apart(state, state.rows([leader])) | (np.arange(len(state.x)) == leader)
@@ -349,7 +356,7 @@ class _Descent(DampedProblem):
 
     def strayed(self, state: Starts) -> list[str]:
         """Parameters of interest far from their initial means that the data do not tell sharply."""
-        slopes = self.jacobian(state)[0]
+        slopes = self.slopes(state)
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
         far, open_ = np.abs(state.x[0]) > self.config.reset_distance, deviation > self.config.reset_deviation
         which = ~self.space.nuisance & far & open_
@@ -363,7 +370,7 @@ class _Descent(DampedProblem):
         """
         settled, slopes = hops == 0, None
         for number in range(hops):
-            slopes = self.jacobian(state)[0]
+            slopes = self.slopes(state)
             hopped = self.hop(state, slopes, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]
             least = max(self.config.basin_hop_tolerance, excess)
