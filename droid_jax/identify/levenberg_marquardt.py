@@ -1,10 +1,10 @@
 """Levenberg-Marquardt in batches: one iteration of several starts at once, in search coordinates.
 
 An iteration is one batch of central differences, then batches of trial steps for as long as they pay.  Each of them
-corrects the Jacobian by what the trials before it have shown (`secant_slopes`).  A trial differs from the next in its damping, its length and its path: straight in search coordinates, or straight
-in physical units.  Residuals are close to linear in masses, springs and damping, whose search coordinate is their
-logarithm; where two of them trade with each other (door and knob turn about the same hinge), the valley between them is
-straight in physical units alone.
+corrects the Jacobian by what the trials before it have shown (`secant_slopes`).  A trial differs from the next in its
+damping, its length and its path: straight in search coordinates, or straight in physical units.  Residuals are close to
+linear in masses, springs and damping, whose search coordinate is their logarithm; where two of them trade with each
+other (door and knob turn about the same hinge), the valley between them is straight in physical units alone.
 """
 
 from __future__ import annotations
@@ -281,13 +281,13 @@ class DampedProblem:
         """
         replays = self._config.trials, self._config.trials + 2 * len(self.space)
         going, first, jacobian = np.arange(len(state.x)), np.zeros(len(state.x)), jacobian.copy()
-        for number in range(self._config.chords):
+        for batch in range(self._config.chords):
             last = state.rows(going)
             trials = self.trials(last, jacobian[going], None if held is None else held[going])
             residual = self.replay(trials.reshape(-1, trials.shape[-1])).reshape(*trials.shape[:2], -1)
             now = self.taken(last, trials, residual)
             state, fell = state.with_rows(going, now), fall(last.objective, now.objective)
-            first = first if number else fell
+            first = first if batch else fell
             for k in np.flatnonzero(fell > 0):  # where a start stands still, differences are better than any trial
                 points, seen = np.vstack([last.x[k], trials[k]]), np.vstack([last.residual[k], residual[k]])
                 steps, changes = points - now.x[k], seen - now.residual[k]
