@@ -246,12 +246,13 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     begun = SelectionStep(found, model.keys, tuple(ranked))
     promising, notes = _one_step_fits(problem, model, ranked[: config.one_step_fits], found)
     sure, others = promising[: config.sure_refits], promising[config.sure_refits :]
-    target = target_objective(problem, model)
-    others = [look for look in others if not _hopeless(model, look[1], target, config.refit)]
     others = sorted(others, key=lambda look: look[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda look: look[1])[: config.full_refits]
     starters = [((*model.parts, *p.parts), values) for values, _, p in best]
-    tried, more = staged_refit(problem, starters, target, "candidates not refitted")
+    certain = {id(p) for _, _, p in sure}
+    reached = [-np.inf if id(p) in certain else objective for _, objective, p in best]
+    aim, before = target_objective(problem, model), model.refined.objective
+    tried, more = staged_refit(problem, starters, aim, "candidates not refitted", gains=(before, reached))
     notes += more
     done = _decided(problem, model, begun, tried)
     near = _collinear_candidates(done, config.selection.collinear)
@@ -262,12 +263,6 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     what = "candidates collinear with the best not refitted"
     beside, more = staged_refit(problem, starters, aim, what, " (collinear with the best)")
     return _decided(problem, model, begun, [*tried, *beside]), notes + more
-
-
-def _hopeless(model: FittedModel, objective: float, target: float, config: RefineConfig) -> bool:
-    """Whether a candidate that reached `objective` in one step from `model` is out of reach of the target, by the rule
-    that gives up a refit (`RefineConfig.give_up`)."""
-    return config.give_up * (model.refined.objective - objective) < objective - target
 
 
 def _one_step_fits(
@@ -302,19 +297,27 @@ def _refit(
 
 
 def staged_refit(
-    problem: Problem, starters: Sequence[Starter], aim: float, what: str, note: str = ""
+    problem: Problem,
+    starters: Sequence[Starter],
+    aim: float,
+    what: str,
+    note: str = "",
+    gains: tuple[float, Sequence[float]] | None = None,
 ) -> tuple[list[FittedModel], Notes]:
     """Refits one after the other; one that will not reach the objective `aim`, or the best so far, is given up early.
 
-    what: says in words what is left out where time runs out.
+    what: says in words what is left out where time runs out.  gains: the objective before, and what each reached in one
+    step; where that step is hopeless by the rule that gives up a refit (`RefineConfig.give_up`), none is begun.
     """
-    models, failed = list[FittedModel](), list[str]()
+    models, failed, config = list[FittedModel](), list[str](), problem.case.config.refit
     for number, (parts, start) in enumerate(starters):
         if number and problem.late:
             return models, Notes(tuple(failed)) + _late(len(starters) - number, len(starters), what)
         aim = min([aim, *(m.refined.objective for m in models)])
+        if gains is not None and config.give_up * (gains[0] - gains[1][number]) < gains[1][number] - aim:
+            continue
         try:
-            models.append(_refit(problem, parts, start, replace(problem.case.config.refit, target_objective=aim), note))
+            models.append(_refit(problem, parts, start, replace(config, target_objective=aim), note))
         except NotReplayed:
             failed.append(names_of(p.key for p in parts))
     return models, Notes(tuple(failed))
