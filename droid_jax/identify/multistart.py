@@ -88,7 +88,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     basin_hop_longest: float = 1.0
     basin_hop_tolerance: float = 2.0
     basin_hop_excess_tolerance: float = 4e-3
-    basin_hop_misfit: float = 2.0
+    basin_hop_misfit: float = 1.5
     reset_distance: float = 1.0
     reset_deviation: float = 0.05
 
