@@ -243,11 +243,11 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     """Add the effect that does best on the validation recording, if one passes its test."""
     case, config = problem.case, problem.case.config
     ranked = proposals(found, model.residuals, case.full_space)
-    begun = SelectionStep(found, model.keys, tuple(ranked))
     promising, notes = _one_step_fits(problem, model, ranked[: config.one_step_fits], found)
     sure, others = promising[: config.sure_refits], promising[config.sure_refits :]
     others = sorted(others, key=lambda look: look[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda look: look[1])[: config.full_refits]
+    begun = SelectionStep(found, model.keys, tuple(ranked), tuple(p for _, _, p in best))
     starters = [((*model.parts, *p.parts), values) for values, _, p in best]
     certain = {id(p) for _, _, p in sure}
     reached = [-np.inf if id(p) in certain else objective for _, objective, p in best]
@@ -432,7 +432,8 @@ def _much_left(problem: Problem, model: FittedModel) -> bool:
 def _pairs(problem: Problem, model: FittedModel, first: SelectionStep) -> tuple[SelectionStep, Notes]:
     case, config = problem.case, problem.case.config
     best = sorted(first.tests, key=lambda t: t.discrepancy_validation)[: config.full_refits]
-    among = {key for t in best for key in t.keys}
+    known = dict.fromkeys([key for one in (*best, *first.nearest) for key in one.keys])
+    among = {*list(known)[: config.full_refits]}
     ranked = proposals(first.score_test, problem.base.residuals, case.full_space, number=2, among=among)
     ranked = [p for p in ranked if set(p.keys) != set(model.keys)][: config.pair_refits]
     starters = [(p.parts, p.start(case.full_space, problem.base.values)) for p in ranked]

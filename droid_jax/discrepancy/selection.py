@@ -93,6 +93,7 @@ class SelectionStep:
     score_test: of the model that stood before.
     before: the effects in it.
     ranked: what could be added, the best first.
+    nearest: of these the ones that did best in one step, whether or not they were refitted.
     tried, tests: the refitted models and their validation tests.
     selected, chosen: the one that does best and its test, or None.
     """
@@ -100,6 +101,7 @@ class SelectionStep:
     score_test: ScoreTest
     before: Keys = ()
     ranked: tuple[Proposal, ...] = ()
+    nearest: tuple[Proposal, ...] = ()
     tried: tuple[FittedModel, ...] = ()
     tests: tuple[ValidationTest, ...] = ()
     selected: FittedModel | None = None
