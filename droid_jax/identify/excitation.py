@@ -21,7 +21,7 @@ import numpy as np
 from droid_jax.arguments import check_fields, instance, number, whole
 from droid_jax.cost.channels import check_channels, chosen_channels
 from droid_jax.cost.cost import Cost, make_cost
-from droid_jax.cost.residuals import CompareConfig, Comparison, restated
+from droid_jax.cost.residuals import CompareConfig, Comparison, with_estimated_noise
 from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.holdout import beginning
 from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability, posterior
@@ -226,7 +226,7 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig, engine: str) ->
         if better is None:
             break
         x, count = better, count + 1
-    cost = cost.compared_by(restated(cost.comparisons, first))
+    cost = cost.compared_by(with_estimated_noise(cost.comparisons, first))
     residuals = cost.whitened_of(rollouts)
     objective = float(penalised(x[None], np.asarray(residuals[:1], np.float64), prior)[0])
     refined = Refined(

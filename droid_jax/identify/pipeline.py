@@ -426,17 +426,17 @@ def _refined(
     whole = early is base
     if all(c.repeats > 1 for c in base.comparisons):
         return base, run(base, base.first() if whole else early, begin)
-    early = early.restated(begin[0])
+    early = early.with_estimated_noise(begin[0])
     first = run(early, early.first(), begin)
-    base, count = base.restated(first.best), first.evaluations
+    base, count = base.with_estimated_noise(first.best), first.evaluations
     # The first one has looked for other basins, and in plain C twice where nothing was found.
     settled = replace(settings, basin_hops=0, patience=(config.refine or settings).patience)
     if acting := with_acting(base.space, first.best, coefficients):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
         short = replace(settled, iterations=config.sorting, spreads=0, pruning_ratio=config.sorting_ratio)
         first = run(worst, None, np.stack([first.best, *acting]), short)
-        base, count = base.restated(first.best), count + first.evaluations
-    last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)
+        base, count = base.with_estimated_noise(first.best), count + first.evaluations
+    last = run(base, base.first() if whole or acting else early.with_estimated_noise(first.best), first.best, settled)
     return base, replace(last, evaluations=count + last.evaluations)
 
 

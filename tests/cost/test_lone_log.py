@@ -27,7 +27,7 @@ def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
     cost = make_cost(ready(scene), elbow_space(scene), [elbow_log(COULOMB)], config=CONFIG.compare)
     values = elbow_space(scene).mean
     whole = log.space.mean
-    stated = cost.restated(values)
+    stated = cost.with_estimated_noise(values)
     deviation = 1 / stated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
     everywhere = np.ones(len(log.clock), bool)
     own = log.with_noise(np.array([deviation]), everywhere)

@@ -15,7 +15,7 @@ import pytest
 
 from droid_jax.cost import observation as measured
 from droid_jax.cost.replay_cache import Batched, cached
-from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, with_estimated_noise
 from droid_jax.door.scene import door_scene
 from droid_jax.identify.fit import search_cost
 from droid_jax.model.effect_interface import Rollout
@@ -403,7 +403,7 @@ def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene
     comparison = compare(scene, recording(*channels), channels={"torque": 1.0, "position": 1.0})
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = rollout(torque=rollout().torque + 0.5 * wave, position=rollout().position + 0.02 * wave)
-    (stated,) = restated([comparison], [tried])
+    (stated,) = with_estimated_noise([comparison], [tried])
     torque, position = (1 / stated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
     np.testing.assert_allclose(torque / position, 25.0, rtol=0.01)
     assert np.all(torque > 0.3)
@@ -417,10 +417,11 @@ def test_recordings_of_the_same_columns_share_a_restated_noise(scene: Scene):
     repeated = compare(scene, recording(channel("torque", CLOCK, np.repeat(rollout().torque[None], 2, axis=0))))
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5, 0.7, 0.7)]
-    *of_logs, untouched = restated([*logs, repeated], tried)
+    *of_logs, untouched = with_estimated_noise([*logs, repeated], tried)
     whiteners = [c.channel("torque").noise.whitener for c in of_logs]
     alone = [
-        1 / restated([c], [t])[0].channel("torque").noise.whitener[:, 0, 0] for c, t in zip(logs, tried, strict=False)
+        1 / with_estimated_noise([c], [t])[0].channel("torque").noise.whitener[:, 0, 0]
+        for c, t in zip(logs, tried, strict=False)
     ]
     assert alone[0] == pytest.approx(alone[2] / 7, rel=0.05)
     shared = np.sqrt(np.mean(np.square(alone), axis=0))
@@ -435,8 +436,8 @@ def test_a_log_whose_simulation_blew_up_takes_nothing_from_the_others(scene: Sce
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5)]
     blown = rollout(torque=np.full_like(rollout().torque, np.nan), finite=np.array(False))
-    *both, kept = restated(logs, [*tried, blown])
-    alone = restated(logs[:2], tried)
+    *both, kept = with_estimated_noise(logs, [*tried, blown])
+    alone = with_estimated_noise(logs[:2], tried)
     for one, other in zip(both, alone, strict=True):
         np.testing.assert_array_equal(one.channel("torque").noise.whitener, other.channel("torque").noise.whitener)
     assert kept is logs[2]
@@ -475,8 +476,8 @@ def test_a_dead_channel_is_refused(scene: Scene):
         compare(scene, recording(channel("torque", CLOCK, values)))
 
 
-@pytest.mark.parametrize(("repeats", "dead", "do"), [(3, 3, "leave the joint away"), (3, 1, "mask it out there, or le"),
-                                                     (2, 1, "leave that repeat away")])  # fmt: skip
+@pytest.mark.parametrize(("repeats", "dead", "do"), [(3, 3, "leave the joint out"), (3, 1, "mask it out there, or le"),
+                                                     (2, 1, "leave that repeat out")])  # fmt: skip
 def test_what_is_advised_of_a_dead_column_works(scene: Scene, repeats: int, dead: int, do: str):
     """Masking was advised where it leaves no repeat, or one, that measured the column, which is refused in turn."""
     values = np.random.default_rng(0).normal(size=(repeats, STEPS, 3))
@@ -526,7 +527,7 @@ def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
 def test_a_dropout_of_one_repeat_is_left_out(scene: Scene, stamps: bool):
     """Five lost samples of a 50 Hz log were refused, and `check` called them harmless.
 
-    A trace's size is fitted: with the dropout as without, whatever stands there, and with a restated noise too.
+    A trace's size is fitted: with the dropout as without, whatever stands there, and with an estimated noise too.
     """
     slow = np.arange(0.0, 2.0, 0.02)
     shape = smooth_traces(3, 1)
