@@ -68,7 +68,6 @@ GOOD = {"name": "a", "unit": "kg", "mean": 1.0, "std": 0.5, "low": 0.1, "high": 
         (lambda: CmaConfig(sigma=math.nan), "sigma must be finite, got nan"),
         (lambda: CmaConfig(tol_cost=-1.0), "tol_cost must be at least 0, got -1.0"),
         (lambda: CmaConfig(max_seconds=math.inf), "max_seconds must be finite, got inf"),
-        (lambda: CmaConfig(bounds="bounce"), "bounds must be one of resample, clip"),  # pyright: ignore
         (lambda: RefineConfig(iterations=-1), "iterations must be at least 0, got -1"),
         (lambda: RefineConfig(give_up=0.0), "give_up must be above 0, got 0.0"),
         (lambda: RefineConfig(chords=0), "chords must be at least 1, got 0"),
