@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior, space_from_json, space_to_json
+from droid_jax.identify.gaussian import Gaussian, ParameterEntry, load_gaussian, prior, space_of, space_to_json
 from droid_jax.identify.truncated_normal import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
+from droid_jax.read_json import typed
 
 
 def wide(name, mean=0.0, std=1.0, **kw):
@@ -237,7 +238,11 @@ def test_save_and_load_give_the_same_gaussian(saved):
     assert os.listdir(path.parent) == [path.name]
 
 
-def test_roles_survive_json_text_and_older_files_state_none():
+def space_from_json(entries):
+    return space_of(typed(entries, list[ParameterEntry], "space"))
+
+
+def test_roles_survive_json_and_may_be_missing_as_in_older_files():
     one = Parameter("a", "kg", 0.0, 1.0, -5.0, 5.0, role=Role.PAYLOAD_MASS)
     other = Parameter("torque_offset[b]", "N m", 0.0, 1.0, -5.0, 5.0)
     entries = json.loads(json.dumps(space_to_json(Space((one, other)))))
@@ -247,7 +252,7 @@ def test_roles_survive_json_text_and_older_files_state_none():
     assert space_from_json(entries)["a"].role is Role.OTHER
 
 
-def test_the_space_survives_json_text():
+def test_the_space_survives_json():
     space = Space((wide("a"), log_parameter(writes=WRITES)))
     assert space_from_json(json.loads(json.dumps(space_to_json(space)))) == space
 
