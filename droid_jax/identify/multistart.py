@@ -11,7 +11,7 @@ in three ways: hypotheses, a reset to initial means, and CMA-ES around the point
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -117,6 +117,33 @@ class RefineConfig(LevenbergMarquardtConfig):
             basin_hop_generations=partial(whole, least=1),
             basin_hop_population=partial(whole, least=2),
         )
+
+
+@dataclass(frozen=True)
+class RefineInCConfig:
+    """Settings that replace those of `RefineConfig` if plain C MuJoCo does the replays.
+
+    In C there are no blocks of rows to fill, so fewer candidate steps are cheaper.  There are no contact pairs, whose
+    sticking and slipping makes small basins, so no searches for better basins are needed.  In double precision one pass
+    over the posterior's axes gives the final Jacobian.
+
+    dampings, lengths, patience, basin_hops, spreads: see `RefineConfig`.
+    """
+
+    dampings: tuple[float, ...] = (0.1, 1.0, 10.0, 1e3)
+    lengths: tuple[float, ...] = (1.0,)
+    patience: int = 2
+    basin_hops: int = 0
+    spreads: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self.applied(RefineConfig())).items():  # the checks are those of RefineConfig
+            if hasattr(self, name):
+                arguments.set_field(self, name, value)
+
+    def applied(self, config: RefineConfig) -> RefineConfig:
+        """Return `config` with these settings."""
+        return replace(config, **{f.name: getattr(self, f.name) for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
