@@ -77,11 +77,11 @@ class ProposalConfig:
             self,
             **dict.fromkeys(("seconds", "rate", "ramp", "step", "swing", "hold", "ease"), above),
             **dict.fromkeys(("torque_share", "range_share", "margin"), share),
-            chirp=several(above),
+            chirp=several(above, 2),
             least_gain=partial(number, least=0),
             most=partial(whole, least=0),
         )
-        if len(self.chirp) != 2 or self.chirp[0] == self.chirp[1]:
+        if self.chirp[0] == self.chirp[1]:
             raise ValueError(f"chirp must have two different frequencies, got {self.chirp}")
 
 

@@ -41,7 +41,7 @@ from droid_jax.rehearsal.full import (
     scores,
     synthetic_log,
 )
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, leftover
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, unabsorbed
 from droid_jax.rehearsal.linearised import fine_steps, rehearsed
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import _some_flips, smallest_sizes
@@ -174,14 +174,15 @@ def test_a_parameter_absorbs_an_effect_only_as_far_as_its_bounds():
     raw[0] = 10.0 * model.train.base[:, 0] + 0.3 * raw[0]
     part = LinearPart(raw, model.train.base, model.train.rows, model.train.channel)
     near = of_repeats(train=part, validation=part, base_low=np.full(BASE, -3.0), base_high=np.full(BASE, 3.0))
-    of, held = leftover(near, 0), near.held(1.0)
-    assert len(of.begins) > 1
+    part_of_effect, prior = unabsorbed(near, 0), near.prior_of_repeat(1.0)
+    assert len(part_of_effect.begins) > 1
     for size in (0.1, 0.5, 2.0):
-        columns, target = np.vstack([part.base, np.diag(1 / held)]), np.r_[size * raw[0], np.zeros(BASE)]
+        columns, target = np.vstack([part.base, np.diag(1 / prior)]), np.r_[size * raw[0], np.zeros(BASE)]
         fit = lsq_linear(columns, target, bounds=(-3.0, 3.0)).x
-        left = size * raw[0] - part.base @ fit
-        assert np.linalg.norm(of.at(size)[1] - left) < 1e-3 * np.linalg.norm(left)
-        assert of.size_of(np.array([np.linalg.norm(left)]), "validation")[0] == pytest.approx(size, rel=0.02)
+        residual = size * raw[0] - part.base @ fit
+        assert np.linalg.norm(part_of_effect.at(size)[1] - residual) < 1e-3 * np.linalg.norm(residual)
+        norm = np.array([np.linalg.norm(residual)])
+        assert part_of_effect.size_of(norm, "validation")[0] == pytest.approx(size, rel=0.02)
     unbounded = of_repeats(train=part, validation=part)
     (loose,), (tight,) = (smallest_sizes(m, [0], CONFIG) for m in (unbounded, near))
     assert tight.size < 0.8 * loose.size
@@ -197,9 +198,9 @@ def test_alternatives_are_the_candidates_that_act_alike():
     (size,) = smallest_sizes(near, [0], CONFIG)
     others = alternatives_of(near, 0, size.size, DiscrepancyConfig(), CONFIG.share)
     assert others[0].key.effect == "effect1" and others[0].share > 0.9
-    assert size.size < others[0].apart < np.inf
-    apart = [r.key.effect for r in alternatives_of(near, 0, 2 * others[0].apart, DiscrepancyConfig(), CONFIG.share)]
-    assert "effect1" not in apart
+    assert size.size < others[0].distinguishable_from < np.inf
+    twice = 2 * others[0].distinguishable_from
+    assert "effect1" not in [r.key.effect for r in alternatives_of(near, 0, twice, DiscrepancyConfig(), CONFIG.share)]
     one_way = np.zeros(DIRECTIONS)
     low = of_repeats(train=part, validation=part, low=one_way, high=np.where(np.arange(DIRECTIONS) == 1, 1e-9, np.inf))
     assert "effect1" not in [
