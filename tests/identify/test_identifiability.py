@@ -57,7 +57,7 @@ def deviations(gaussian):
     return np.sqrt(np.diag(gaussian.cov))
 
 
-def apart(repeats):
+def deviations_from_mean(repeats):
     """Deviations of repeats [N, M] from their mean, as a comparison gives them."""
     return repeats - repeats.mean(axis=0)
 
@@ -69,7 +69,7 @@ def white(rng, count, size):
 
 def exactly(scale, count, size):
     """Deviations [N, M] of repeats whose mean has noise of exactly this scale, uncorrelated between residuals."""
-    draws = apart(np.random.default_rng(9).normal(size=(count, size)))
+    draws = deviations_from_mean(np.random.default_rng(9).normal(size=(count, size)))
     return scale * np.sqrt(count * (count - 1)) * np.linalg.qr(draws)[0]
 
 
@@ -83,7 +83,7 @@ SQUARE = np.kron(np.eye(2), np.full((8, 1), 5.0))  # [16, 2]: eight residuals se
 def test_repeats_with_the_assumed_noise_give_the_gauss_newton_covariance():
     """A thousand repeats whose mean has unit white noise, as H^-1 assumes."""
     fit = fitted(SKEW)
-    gaussian = calibrated(fit, [apart(white(np.random.default_rng(1), 1000, 30))], one_block(SKEW))
+    gaussian = calibrated(fit, [deviations_from_mean(white(np.random.default_rng(1), 1000, 30))], one_block(SKEW))
     plain = np.linalg.inv(SKEW.T @ SKEW + np.eye(3) / 16)
     np.testing.assert_allclose(gaussian.cov, plain, rtol=0.1)
     np.testing.assert_array_equal(gaussian.mean, fit.x)
@@ -122,7 +122,7 @@ def test_a_pattern_shared_by_all_residuals_widens_the_parameter_that_it_looks_li
 def test_own_ratio_outweighs_the_pool_with_many_repeats():
     rng = np.random.default_rng(4)
     repeats = white(rng, 400, 16) + np.outer(rng.normal(scale=20.0, size=400), SQUARE[:, 0]) / np.sqrt(200.0)
-    gaussian = calibrated(fitted(SQUARE), [apart(repeats)], one_block(SQUARE))
+    gaussian = calibrated(fitted(SQUARE), [deviations_from_mean(repeats)], one_block(SQUARE))
     factor = deviations(gaussian) * np.sqrt(200.0 + 1 / 16)
     # the shared part adds 20^2 / N to a variance of 1: p0 doubles its variance, p1 keeps it
     np.testing.assert_allclose(factor**2, [2.0, 1.0], rtol=0.12)
@@ -190,7 +190,9 @@ def test_the_larger_of_both_scatters_is_used_for_each_parameter():
 def test_widening_keeps_correlations():
     """Deviations change by different factors, correlations do not."""
     rng = np.random.default_rng(7)
-    repeats = apart(white(rng, 50, 30) + 30.0 * np.outer(rng.normal(size=50), SKEW[:, 0] / np.linalg.norm(SKEW[:, 0])))
+    repeats = deviations_from_mean(
+        white(rng, 50, 30) + 30.0 * np.outer(rng.normal(size=50), SKEW[:, 0] / np.linalg.norm(SKEW[:, 0]))
+    )
     fit = fitted(SKEW, nuisances=1)
     plain, wide = np.linalg.inv(fit.hessian), calibrated(fit, [repeats], one_block(SKEW)).cov
     factor = np.sqrt(np.diag(wide) / np.diag(plain))
@@ -212,7 +214,7 @@ def one_problem(rng):
     repeats = jacobian @ truth + white(rng, REPEATS, 40) + pose
     measured = repeats.mean(axis=0)
     x = np.linalg.solve(jacobian.T @ jacobian + np.eye(3) / 16, jacobian.T @ measured)
-    return fitted(jacobian, jacobian @ x - measured, x=x), apart(repeats), truth
+    return fitted(jacobian, jacobian @ x - measured, x=x), deviations_from_mean(repeats), truth
 
 
 def another_problem(rng):
@@ -280,7 +282,7 @@ def test_every_channel_needs_its_duration():
 # ---------------------------------------------------------------- which parameters are identifiable
 
 
-def told():
+def four_verdicts():
     """Four posteriors of 12, 24.75, 26 and 98 % of their stated priors; p0 is correlated with p1 and p3.
 
     Three have a prior four times as wide in the refinement, which counts for nothing here, one has a narrower one.
@@ -294,14 +296,14 @@ def told():
 
 
 def test_a_parameter_is_identifiable_below_a_quarter_of_its_prior():
-    verdicts = told()
+    verdicts = four_verdicts()
     assert [v.name for v in verdicts] == ["p0", "p1", "p2", "p3"]
     np.testing.assert_allclose([v.shrinkage for v in verdicts], [0.12, 0.2475, 0.26, 0.98])
     assert [v.identifiable for v in verdicts] == [True, True, False, False]
 
 
 def test_partners_are_those_of_strong_correlation_with_its_sign_the_strongest_first():
-    partners = [dict(v.partners) for v in told()]
+    partners = [dict(v.partners) for v in four_verdicts()]
     assert [list(p) for p in partners] == [["p3", "p1"], ["p0"], [], ["p0"]]
     assert partners[0] == pytest.approx({"p3": -0.75, "p1": 0.72})
     assert partners[3] == pytest.approx({"p0": -0.75})
@@ -315,8 +317,8 @@ def test_no_more_than_three_partners_are_named():
 
 
 def test_reasons_state_the_shrinkage_and_partners_the_correlations():
-    assert [[n for n, _ in v.partners] for v in told()] == [["p3", "p1"], ["p0"], [], ["p0"]]
-    reasons = [v.reason for v in told()]
+    assert [[n for n, _ in v.partners] for v in four_verdicts()] == [["p3", "p1"], ["p0"], [], ["p0"]]
+    reasons = [v.reason for v in four_verdicts()]
     assert reasons == [
         "the data narrow the prior to 12%",
         "the data narrow the prior to 25%",
@@ -333,15 +335,15 @@ def test_the_distance_from_the_prior_mean_is_in_deviations_of_the_stated_prior()
 
 
 def test_a_parameter_that_the_data_do_not_constrain_keeps_its_prior():
-    """From Jacobian to verdict: p1 changes the residuals by a thousandth of the noise per prior deviation."""
+    """From Jacobian to verdict: p1 hardly changes the residuals."""
     fit = fitted(SQUARE * [1.0, 1e-5])
     gaussian = calibrated(fit, [np.zeros((1, 16))], one_block(SQUARE))
-    seen, unseen = identifiability(gaussian, fit.prior)
-    assert seen.identifiable and seen.shrinkage == pytest.approx(1 / np.sqrt(200.0), rel=1e-3)
-    assert not unseen.identifiable and unseen.shrinkage == pytest.approx(
+    first, second = identifiability(gaussian, fit.prior)
+    assert first.identifiable and first.shrinkage == pytest.approx(1 / np.sqrt(200.0), rel=1e-3)
+    assert not second.identifiable and second.shrinkage == pytest.approx(
         4.0, abs=1e-4
     )  # as wide as the refinement let it
-    assert unseen.reason == "the data leave all of the prior's width"
+    assert second.reason == "the data leave all of the prior's width"
 
 
 def test_a_posterior_as_wide_as_the_stated_prior_is_not_identifiable():
@@ -375,8 +377,8 @@ def test_an_unconstrained_parameter_has_its_stated_prior_in_the_result():
     np.testing.assert_allclose(np.sqrt(np.diag(handed.cov)), [2 / np.sqrt(200), 1.0], rtol=0.02)
     np.testing.assert_array_equal(handed.mean, wide.mean)
     skewed = fitted(100 * SKEW)
-    told = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
-    np.testing.assert_allclose(with_stated_prior(told, skewed).cov, told.cov, rtol=0.02)
+    constrained = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
+    np.testing.assert_allclose(with_stated_prior(constrained, skewed).cov, constrained.cov, rtol=0.02)
     plain = fitted(SQUARE, width=1.0)  # none wider was used, nothing widened
     alone = calibrated(plain, [exactly(0.5, 20, 16)], one_block(SQUARE))
     np.testing.assert_allclose(with_stated_prior(alone, plain).cov, alone.cov, rtol=1e-9)

@@ -420,10 +420,10 @@ def test_a_first_look_takes_the_configured_steps():
 def test_first_looks_share_batches_and_end_as_if_they_were_separate():
     """Each frees one of two parameters.  The first is linear and converges after one batch."""
 
-    def apart(v: np.ndarray) -> np.ndarray:
+    def separate(v: np.ndarray) -> np.ndarray:
         return np.stack([v[:, 0] - 1.5, 10.0 * np.arctan(0.1 * (3.0 * v[:, 1] - 30.0))], axis=1)
 
-    recorder, slopes = Recorder(apart), np.diag([1.0, 3.0])
+    recorder, slopes = Recorder(separate), np.diag([1.0, 3.0])
     looks = [
         Look(Space((line(name),)), np.array([[0.0], [1.0]]), slopes[:, [k]], partial(with_zero, k))
         for k, name in enumerate("ab")
@@ -462,14 +462,14 @@ def test_a_start_outside_the_bounds_is_refused():
 
 def test_progress_rises_and_every_replay_is_counted():
     """The stages are a cheap part, a hypothesis, all data, and hops."""
-    cheap, full, seen = Recorder(two_basins), Recorder(two_basins), []
+    cheap, full, reports = Recorder(two_basins), Recorder(two_basins), []
     config = RefineConfig(main_prior=1e6, basin_hop_generations=3)
-    fit = refine(full, BASINS, [3.9, 9.0], config, first=cheap, hypotheses=[{"s": -2.8}], progress=seen.append)
+    fit = refine(full, BASINS, [3.9, 9.0], config, first=cheap, hypotheses=[{"s": -2.8}], progress=reports.append)
     assert fit.evaluations == len(cheap.rows) + len(full.rows)
-    numbers = [p.iteration for p in seen]
+    numbers = [p.iteration for p in reports]
     assert len(numbers) > 3 and numbers[0] == 1 and np.all(np.diff(numbers) >= 1)
-    assert numbers[-1] == fit.iterations and {p.iterations for p in seen} == {config.iterations}
-    assert seen[-1].mean_square == pytest.approx(2 * fit.objective / 3, abs=1e-6)
+    assert numbers[-1] == fit.iterations and {p.iterations for p in reports} == {config.iterations}
+    assert reports[-1].mean_square == pytest.approx(2 * fit.objective / 3, abs=1e-6)
 
 
 def test_iterations_are_limited_and_the_result_is_then_not_converged():
@@ -478,11 +478,11 @@ def test_iterations_are_limited_and_the_result_is_then_not_converged():
     def rosenbrock(values):
         return np.stack([10.0 * (values[:, 1] - values[:, 0] ** 2), 1.0 - values[:, 0]], axis=1)
 
-    seen = []
+    reports = []
     start, few = [-1.2, 1.0], dataclasses.replace(FLAT, iterations=1)
-    fit = refine(rosenbrock, BASINS, start, few, progress=seen.append)
-    assert fit.iterations == 1 and len(seen) == 1 and not fit.converged
-    assert fit.objective > 0.1 and seen[0].mean_square == pytest.approx(np.mean(fit.residual**2), rel=1e-6)
+    fit = refine(rosenbrock, BASINS, start, few, progress=reports.append)
+    assert fit.iterations == 1 and len(reports) == 1 and not fit.converged
+    assert fit.objective > 0.1 and reports[0].mean_square == pytest.approx(np.mean(fit.residual**2), rel=1e-6)
     long = refine(rosenbrock, BASINS, start, FLAT)
     assert long.converged and 1 < long.iterations < FLAT.iterations
     np.testing.assert_allclose(long.best, 1.0, atol=1e-3)

@@ -255,8 +255,8 @@ def numpy_cma(generations, dims, population, mu, active):
         pc = (1 - cc) * pc + h * np.sqrt(cc * (2 - cc) * me) * step
         wo = np.where(w >= 0, w, w * dims / ((y @ inverse_root) ** 2).sum(1))
         rank_mu = sum(wi * np.outer(yi, yi) for wi, yi in zip(wo, y, strict=True))
-        kept = 1 + c1 * (1 - h) * cc * (2 - cc) - c1 - cmu * w.sum()
-        cov = kept * cov + c1 * np.outer(pc, pc) + cmu * rank_mu
+        decay = 1 + c1 * (1 - h) * cc * (2 - cc) - c1 - cmu * w.sum()
+        cov = decay * cov + c1 * np.outer(pc, pc) + cmu * rank_mu
         sigma = sigma * np.exp(cs / ds * (length / chi - 1))
         out.append((mean, sigma, sigma**2 * cov))
     return out
@@ -393,8 +393,8 @@ def test_a_search_stalls_by_shares_of_its_cost(size: float):
 
 def test_history_says_what_the_cost_said():
     recorder = Recorder(sphere([1.0, 2.0]))
-    seen = []
-    fit = cma_search(recorder, box(2), endless(generations=5), progress=seen.append)
+    reports = []
+    fit = cma_search(recorder, box(2), endless(generations=5), progress=reports.append)
     costs = np.array([recorder.cost(rows) for rows in recorder.asked])
     np.testing.assert_array_equal(fit.history.costs, costs)
     np.testing.assert_array_equal(fit.history.best_cost, np.minimum.accumulate(costs.min(axis=1)))
@@ -402,8 +402,8 @@ def test_history_says_what_the_cost_said():
     np.testing.assert_allclose(fit.history.median_cost, np.median(costs, axis=1))
     assert fit.best_cost == costs.min()
     np.testing.assert_array_equal(fit.best, np.concatenate(recorder.asked)[costs.argmin()])
-    assert [p.generation for p in seen] == [1, 2, 3, 4, 5] and seen[-1].seconds_left == 0.0
-    assert [p.best_cost for p in seen] == fit.history.best_cost.tolist()
+    assert [p.generation for p in reports] == [1, 2, 3, 4, 5] and reports[-1].seconds_left == 0.0
+    assert [p.best_cost for p in reports] == fit.history.best_cost.tolist()
 
 
 def test_every_generation_and_seed_draws_anew():

@@ -349,9 +349,13 @@ def test_advice_is_wrong_if_an_effect_was_not_found():
         {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
         {**usual, "sure": False, "missed": True, "not_found_at_twice": True, "within": False},
     ]
-    told = summary({"hinge": of})
-    assert told["wrong_advice_rate"] == 0.5 and told["advised"] == 2 and told["within_factor"] == pytest.approx(2 / 3)
-    assert told["within_factor_of_sure"] == 1.0 and told["unsure_not_found"] == 1
+    result = summary({"hinge": of})
+    assert (
+        result["wrong_advice_rate"] == 0.5
+        and result["advised"] == 2
+        and result["within_factor"] == pytest.approx(2 / 3)
+    )
+    assert result["within_factor_of_sure"] == 1.0 and result["unsure_not_found"] == 1
 
 
 def test_one_case_of_five_has_nothing_hidden_and_sizes_stay_inside_bounds(hinge):
@@ -375,10 +379,10 @@ def test_scores_take_the_size_from_which_all_are_found():
     }
     of = [{**usual, "size": s, "found": s > 1.0} for s in (0.5, 1.0, 2.0, 4.0)]
     empty = {**usual, "effect": "", "effects": ["a"], "parameters": [{"name": "m", "recovered": True, "holds": False}]}
-    told = scores([*of, empty, {**empty, "verdict": "error"}], 0.9)
-    assert told["effects"][0]["smallest"] == 2.0 and told["failed"] == 1
-    assert told["nothing_hidden"] == {"cases": 1, "named": 1}
-    assert told["parameters"] == [{"name": "m", "cases": 1, "recovered": 1, "holds": 0}]
+    result = scores([*of, empty, {**empty, "verdict": "error"}], 0.9)
+    assert result["effects"][0]["smallest"] == 2.0 and result["failed"] == 1
+    assert result["nothing_hidden"] == {"cases": 1, "named": 1}
+    assert result["parameters"] == [{"name": "m", "cases": 1, "recovered": 1, "holds": 0}]
 
 
 def test_a_synthetic_log_holds_what_was_hidden_and_the_stated_noise(hinge):
