@@ -280,4 +280,4 @@ def identifiability(
 def _reason(is_identifiable: bool, shrinkage: float) -> str:
     if is_identifiable:
         return f"the data narrow the prior to {shrinkage:.0%}"
-    return f"the data leave {f'{shrinkage:.0%}' if shrinkage < 1 else 'all'} of the prior's width"
+    return f"the data narrow the prior only to {shrinkage:.0%}" if shrinkage < 1 else "the data do not narrow the prior"

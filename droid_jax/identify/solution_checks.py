@@ -153,12 +153,12 @@ def solution_notes(checks: Mapping[str, SolutionCheck], scene: str) -> list[str]
     notes = []
     for name, check in checks.items():
         channel = check.channel.replace("_", " ")
-        error = f"the {check.remaining:.2g} {check.unit} that the fit leaves"
+        error = f"the remaining error of {check.remaining:.2g} {check.unit}"
         if check.too_coarse:
             notes.append(
                 f"the time step of scene {scene!r} is too coarse: at half of its {1e3 * check.time_step:g} ms the "
                 f"fitted {channel}s of {name!r} change by {check.discretisation:.2g} {check.unit} (root mean square), "
-                f"{_share(check.discretisation, check.remaining)} of {error}, and the fitted values make up for it: "
+                f"{_share(check.discretisation, check.remaining)} of {error}, and the fitted values compensate for it: "
                 "give <option> a smaller timestep and fit again"
             )
         if check.engines_differ:

@@ -322,8 +322,8 @@ def test_reasons_state_the_shrinkage_and_partners_the_correlations():
     assert reasons == [
         "the data narrow the prior to 12%",
         "the data narrow the prior to 25%",
-        "the data leave 26% of the prior's width",
-        "the data leave 98% of the prior's width",
+        "the data narrow the prior only to 26%",
+        "the data narrow the prior only to 98%",
     ]
 
 
@@ -343,7 +343,7 @@ def test_a_parameter_that_the_data_do_not_constrain_keeps_its_prior():
     assert not second.identifiable and second.shrinkage == pytest.approx(
         4.0, abs=1e-4
     )  # as wide as the refinement let it
-    assert second.reason == "the data leave all of the prior's width"
+    assert second.reason == "the data do not narrow the prior"
 
 
 def test_a_posterior_as_wide_as_the_stated_prior_is_not_identifiable():
