@@ -161,7 +161,7 @@ class Estimate:
 
 def find(cost: Cost, space: Space, config: CmaConfig) -> Fit:
     """CMA-ES from the prior, the noise stated from what the prior's mean leaves unexplained."""
-    fit = cma_search(cost.restated(space.mean), space, config)
+    fit = cma_search(cost.with_estimated_noise(space.mean), space, config)
     print(f"  CMA-ES: cost {fit.best_cost:.4f} after {len(fit.history.sigma)} generations ({fit.stop})", flush=True)
     return fit
 
@@ -176,7 +176,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
     longest = noise.correlation_time(left).max()
     if longest > block:
         raise ValueError(f"block: residuals stay correlated for {longest:.2f} s, got {block} s")
-    refined = refine(cost.restated(start).whitened, space, start)
+    refined = refine(cost.with_estimated_noise(start).whitened, space, start)
     samples, columns = left.shape
     blocks = time_blocks([(columns, samples)], [samples / noise.DEFAULT_NOISE.rate], block)
     return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter

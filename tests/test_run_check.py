@@ -157,7 +157,7 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     assert open_ones == {"elbow_damping"} == {*excitation["identifiable_by_it"]} and excitation["left_open"] == []
     assert excitation["addition"]
     said = " ".join(capsys.readouterr().out.split())
-    assert "What these recordings tell of the parameters" in said and "record besides" in said
+    assert "What these recordings tell of the parameters" in said and "also record" in said
     assert excitation["sentence"] in (out / "check.html").read_text()
     table = np.genfromtxt(out / "addition.csv", delimiter=",", names=True)
     assert table.dtype.names == ("time", *JOINTS)
@@ -168,7 +168,7 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
 def test_a_motion_that_is_proposed_several_times_is_said_once():
     ramp, steps = (Addition(what, "elbow", np.arange(7.0), np.zeros(7)) for what in ("a slow ramp", "steps"))
     proposal = MotionProposal((ramp, steps, ramp), (), ("mass",), (), ("elbow",), np.zeros(1), 2)
-    assert proposal.sentence == "To tell mass, record besides 2 times a slow ramp, steps: 18 s."
+    assert proposal.sentence == "To make mass identifiable, also record 2 times a slow ramp, steps: 18 s."
 
 
 def with_open_parameters(scene: Scene) -> tuple[Space, Excitation]:
@@ -195,7 +195,7 @@ def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
         (replace(servos, object_joint="elbow"), wave(), "a hand holds an object"),
     ):
         said = propose(scene, space, found, log).sentence
-        assert said.startswith(f"Open stay {', '.join(found.open)}. No motion is proposed: {why}")
+        assert said.startswith(f"Not identifiable: {', '.join(found.open)}. No motion is proposed: {why}")
 
     def failing(*_: object, **__: object) -> None:
         raise ValueError("the time step is too long")

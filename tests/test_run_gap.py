@@ -162,7 +162,7 @@ def test_a_sensor_that_is_dead_in_one_repeat(place: Path, refused):
 
     save_recording(changed(record("train"), "torque", dead), place / "train.npz")
     said = refused(*arguments(place))
-    assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat away" in said
+    assert "never changes in repeat 2 (0.25 N m)" in said and "leave that repeat out" in said
 
 
 def test_a_dead_sensor(place: Path, refused):

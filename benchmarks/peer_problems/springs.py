@@ -9,7 +9,6 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,7 @@ from droid_jax.cost.cost import ENGINES, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.files import EXTENDED
 from droid_jax.identify.extended_model import load_extended
-from droid_jax.identify.multistart import RefineConfig, Refined, refine
-from droid_jax.identify.pipeline import IN_C
+from droid_jax.identify.multistart import RefineConfig, Refined, RefineInCConfig, refine
 from droid_jax.model.fields import model_parameter
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
@@ -118,7 +116,7 @@ def refined(scene: Scene, space: Space, recording: Recording, engine: str, mj_st
     config = CompareConfig(channels={"position": 1.0, "velocity": 1.0}, whitened=True, mj_step=mj_step)
     cost = make_cost(scene, space, [recording], engine=engine, config=config)
     settings = RefineConfig(basin_hops=0, spreads=0)
-    settings = replace(settings, **IN_C) if engine == "mujoco" else settings
+    settings = RefineInCConfig().applied(settings) if engine == "mujoco" else settings
     return refine(cost.whitened, space, space.mean[None], settings)
 
 

@@ -197,7 +197,7 @@ def _json(
     """The content of check.json."""
     import json
 
-    from droid_jax.storage import finite
+    from droid_jax.storage import config_json, finite
 
     def column(entry: dict[str, object]) -> dict[str, object]:
         return {k: finite(v) if isinstance(v, float) else v for k, v in entry.items()}
@@ -222,6 +222,7 @@ def _json(
         whole["excitation"] = {
             "parameters": [column(asdict(t)) for t in found.identifiability],
             "engine": found.engine,
+            "config": config_json(found.config),
             "seconds": found.seconds,
             "sentence": proposal.sentence,
             "addition": [a.what for a in proposal.chosen],

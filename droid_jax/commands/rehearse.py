@@ -217,7 +217,7 @@ def _full(
     name = hashlib.sha256(json.dumps(plain(decides), sort_keys=True).encode()).hexdigest()[:12]
     if any(p.name != name for p in (command.out / "rehearsals").glob("*")):
         print(f"{command.out / 'rehearsals'} also holds rehearsals of other settings or another fit; they do not count")
-    cases = hidden_cases(scene, quick["effects"], command.full)
+    cases = hidden_cases(scene, quick["effects"], command.full, rehearsal)
     results = run_cases(of, cases, command.out / "rehearsals" / name, lambda said: print(said, flush=True))
     return {"form": "full", "full": scores(results, rehearsal.share), "cases": results}
 

@@ -1,4 +1,4 @@
-"""The vmapped cost: parameter vectors in, disagreement with the recordings out.
+"""The vmapped cost: distance between replays and recordings for a batch of parameter vectors.
 
 cost = make_cost(scene, space, [recording])
 cost(values)            # [P, D] -> [P]   N m
@@ -19,7 +19,7 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.arguments import instance, instances, one_of
-from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, with_estimated_noise
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia
@@ -42,7 +42,11 @@ from droid_jax.simulate.servo_gains import check_gains, servo_factors
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cost:
-    """A cost over a space. Call it with [P, D] physical values; everything returns host arrays."""
+    """The cost of recordings over a space.  Call it with physical values [P, D]; all methods return host arrays.
+
+    scene: what is simulated.  space: meaning of the D entries.  comparisons: one for each of R recordings.
+    drives: what each replay follows, commands or a measured motion.
+    """
 
     scene: Scene
     space: Space
@@ -60,99 +64,107 @@ class Cost:
         return f"<Cost of {names} over {len(self.space)} parameters of scene {self.scene.name!r}>"
 
     def __call__(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P] cost, the mean over the recordings; never NaN."""
+        """Return the cost [P] at values [P, D], the mean over the recordings; never NaN."""
         return np.mean(self.distances(values), axis=1)
 
     def distances(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, R] cost of each recording."""
+        """Return the cost [P, R] of each recording at values [P, D]."""
         return self._blockwise(values, self._distances, lambda parts: np.stack(parts, axis=1))
 
     def whitened(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, M] residuals of all recordings, in units of the noise of the repeats' mean."""
+        """Return residuals [P, M] of all recordings at values [P, D], in units of the noise of the repeats' mean."""
         return self._blockwise(values, self._whitened, lambda parts: np.concatenate(parts, axis=1))
 
     def failed(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P] bool: the grasp was lost, the door stayed shut, or the replay blew up."""
+        """Return [P] bool at values [P, D]: the grasp was lost, the door stayed shut, or the replay blew up."""
         return self._blockwise(values, self._failed, lambda parts: np.any(np.stack(parts), axis=0))
 
     def penalties(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, R] N m: the part c beta of each recording's cost."""
+        """Return the part c beta [P, R] N m of each recording's cost at values [P, D]."""
         failed = self._blockwise(values, self._beta, lambda parts: np.stack(parts, axis=1))
         return failed * np.array([c.config.failure_cost for c in self.comparisons])
 
     def smoothed(self, values: Any) -> tuple[np.ndarray, ...]:
-        """[P, D] -> for each recording its leading channel (the torque where compared) through the data's filter,
-        [P, K, C] in the channel's unit.
+        """Return each recording's simulated leading channel (torque where it is compared) at values [P, D].
+
+        The channel [P, K, C] has passed through the filter of the data and is in its own unit.
         """
         return self._blockwise(values, self._smoothed, tuple)
 
     def rollouts(self, values: Any) -> tuple[Rollout, ...]:
-        """[P, D] -> for each recording a Rollout of host arrays [P, T, ...].
+        """Return a Rollout of host arrays [P, T, ...] for each recording, at values [P, D].
 
-        Its `time` is from 0 where commands were replayed; `comparisons[i].clock` [T] is on recording i's own clock.
+        Its `time` starts at 0 where commands were replayed; `comparisons[i].clock` [T] is on recording i's own clock.
         """
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
 
     def whitened_of(self, rollouts: Sequence[Rollout]) -> np.ndarray:
-        """[P, M] residuals in noise units of replays that were made, one Rollout [P, T, ...] for each recording."""
+        """Return residuals [P, M] in noise units of given replays, one Rollout [P, T, ...] for each recording."""
         parts = [np.asarray(f(rollout)) for f, rollout in zip(self._whitened, rollouts, strict=True)]
         return np.concatenate(parts, axis=1)
 
     def compared_by(self, comparisons: Sequence[Comparison]) -> Cost:
-        """The same replays, compared in another way: by comparisons of the same recordings."""
+        """Return a cost with the same replays and other comparisons of the same recordings."""
         return assemble(self.scene, self.space, comparisons, self._replays, self.drives)
 
     def alone(self, number: int) -> Cost:
-        """The cost of one of the recordings, on the same compiled functions."""
+        """Return the cost of one of the recordings, with the same compiled functions."""
         each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("scene", "space")}
         return replace(self, **{name: (of_recordings[number],) for name, of_recordings in each.items()})
 
     def first(self) -> Cost:
-        """The cost of the first recording alone."""
+        """Return the cost of the first recording alone."""
         return self.alone(0)
 
-    def restated(self, values: np.ndarray) -> Cost:
-        """The same replays, with the noise of single repeats restated from what `values` [D] leaves unexplained."""
+    def with_estimated_noise(self, values: np.ndarray) -> Cost:
+        """Return a cost whose noise of single repeats is estimated from the residuals at `values` [D]."""
         rollouts = [jax.tree.map(lambda a: a[0], r) for r in self.rollouts(values[None])]
-        return self.compared_by(restated(self.comparisons, rollouts))
+        return self.compared_by(with_estimated_noise(self.comparisons, rollouts))
 
     def against(self, recordings: Sequence[Recording], config: CompareConfig | None = None) -> Cost:
-        """The same compiled replays compared with other repeats of the same recordings, or in another way.
+        """Return a cost with the same compiled replays, compared with other repeats of the same recordings.
 
-        Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion:
-        its replay is given it.
-        Raises ValueError unless these are as many, with the same commands (where there are none, as many instants on
-        the same clock and the same joints with positions throughout), the same torque convention, `mj_step` and
-        `motion_cutoff`.
+        Repeats that start elsewhere are replayed from there.  A recording without commands may hold another motion,
+        which its replay then follows.
+
+        Args:
+            recordings: as many as this cost has, with the same commands, torque convention and `motion_cutoff`.
+                Recordings without commands need the same clock and the same joints that were measured throughout.
+            config: how simulation and measurement are compared, with the same `mj_step`; None for that of this cost.
+
+        Raises:
+            ValueError: the compiled replays do not fit the recordings or the configuration.
         """
         recordings = recordings_of(recordings)
         if len(recordings) != len(self.drives):
             raise ValueError(f"expected repeats of {len(self.drives)} replayed recordings, got {len(recordings)}")
         if config is not None and any(c.config.mj_step != config.mj_step for c in self.comparisons):
             raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
-        made, drives, replays = [], [], []
+        comparisons, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
             recording = own_starts(given, (config or old.config).start)
             new = followed(self.scene, recording, config or old.config)
             if isinstance(new, Drive):
                 check_gains(self.scene, new)
-            if not _same(self.scene, new, drive):
+            if not _same_program(new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
                     "(side, gravity) or, without commands, has another clock (motion_cutoff changes it too) or other "
                     "joints whose positions were measured throughout"
                 )
-            drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
+            drives.append(drive if _same_start(self.scene, new, drive, (config or old.config).start) else new)
             replays.append(along_another(replay, drives[-1]))
-            made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
-        return assemble(self.scene, self.space, made, replays, drives)
+            comparisons.append(
+                _compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config)
+            )
+        return assemble(self.scene, self.space, comparisons, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
-        """Repeats of a recording as if all had started where its replay does (`repeat_starts.from_one_start`)."""
+        """Return a recording whose repeats all start where replay `index` does (`repeat_starts.from_one_start`)."""
         config = self.comparisons[index].config.start
-        own = own_starts(recording, config)
-        return _from_one_start(self.scene, self.space, own, self.drives[index], self._replays[index], config)
+        recording = own_starts(recording, config)
+        return _from_one_start(self.scene, self.space, recording, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -171,7 +183,7 @@ def make_cost(
     effects: Sequence[Effect] = (),
     check: bool = True,
 ) -> Cost:
-    """The cost of a scene over one or more recordings: equation 1 of the paper.
+    """Return the cost of a scene over one or more recordings: equation 1 of the paper.
 
     A recording with commands is replayed by its servo, one without by inverse dynamics of its measured motion.
 
@@ -182,16 +194,16 @@ def make_cost(
         engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores; the parity oracle).
         config: how simulation and measurement are compared; None for the defaults.
         effects: extra physics or observation models whose parameters are part of the space. Torque offsets, and joint
-            friction behind the sensor where the space holds any, are there already. Those that raise the dry friction
-            of a joint need `registry.ready(scene)`.
-        check: warn of units, signs and clocks in the recordings that can hardly be right (`preflight.check_log`).
+            friction behind the sensor where the space holds any, are built in. Effects that raise the dry friction of a
+            joint need `registry.ready(scene)`.
+        check: warn of implausible units, signs and clocks in the recordings (`preflight.check_log`).
 
     Returns:
-        A cost to be called with [P, D] physical values, which gives [P] N m.
+        A cost. Called with physical values [P, D], it returns [P] N m.
 
     Raises:
         ValueError: a space of another scene, unknown engines, joints or channels, parameters that nothing reads, gains
-            that do not match, or friction effects at joints without a friction row (`registry.ready` makes them).
+            that do not match, or friction effects at joints without a friction row (`registry.ready` adds one).
     """
     config = instance(CompareConfig() if config is None else config, "config", CompareConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -217,65 +229,66 @@ def make_cost(
 
 
 def check_read(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
-    """Raise ValueError for parameters that write no model field and are read by no replay: they would change nothing.
+    """Raise ValueError for parameters that write no model field and that no replay reads: they would have no effect.
 
     An effect that states no parameters may read any of them.
     """
-    late = Role.TIME_OFFSET.in_theta()
-    sensed = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
-    read = {late, *sensed, *(p.name for e in effects for p in e.parameters)}
-    own = [p for p in space.parameters if not p.writes and p.role is not Role.STANDS_FOR]
-    unread = [p.name for p in own if p.name not in read]
+    time_offset = Role.TIME_OFFSET.in_theta()
+    of_joints = [role.in_theta(joint) for role in OF_A_JOINT for joint in scene.joints]
+    read = {time_offset, *of_joints, *(p.name for e in effects for p in e.parameters)}
+    outside_model = [p for p in space.parameters if not p.writes and p.role is not Role.STANDS_FOR]
+    unread = [p.name for p in outside_model if p.name not in read]
     if unread and all(e.parameters for e in effects):
         raise ValueError(
             f"parameters {', '.join(unread)} write no field of the model, and nothing in the replay reads them; names "
-            f"that it reads: {late}, {', '.join(sensed)}, and those of the effects that it is given"
+            f"that it reads: {time_offset}, {', '.join(of_joints)}, and those of the effects that it is given"
         )
 
 
 def check_known(space: Space, recordings: Sequence[Recording]) -> None:
-    """Raise ValueError for parameters that stand for others where no fitted recording says so: nothing fits them."""
-    kept = without_unused(space, recordings).names
-    if idle := [name for name in space.names if name not in kept]:
+    """Raise ValueError for parameters that stand for others only in recordings that are not fitted."""
+    used = without_unused(space, recordings).names
+    if unused := [name for name in space.names if name not in used]:
         raise ValueError(
-            f"parameters {', '.join(idle)} stand for others in recordings that say so, and no fitted one does: state "
-            f"it there (`known`, or convert --known PARAMETER={idle[0]}), or leave them out"
+            f"parameters {', '.join(unused)} stand for others in recordings that say so, and no fitted one does: state "
+            f"it there (`known`, or convert --known PARAMETER={unused[0]}), or leave them out"
         )
 
 
 def check_friction_rows(scene: Scene, space: Space, effects: Sequence[Effect]) -> None:
-    """Raise ValueError where an effect would raise dry friction of a joint that MJX has no friction row for.
+    """Raise ValueError where an effect raises the dry friction of a joint for which MJX has no friction row.
 
-    MJX lays these rows out at compilation: the effect would change nothing.
+    MJX allocates these rows at compilation, so the effect would change nothing.
     """
     for effect in (e for e in effects if e.frictionloss is not None):
-        acts = [at for at, names in effect.locations.items() if not {*names}.isdisjoint(space.names)]
-        joints = [at for at in acts if at in scene.single_joints]
-        if without := [j for j in joints if scene.model.dof_frictionloss[scene.dof(j)] <= 0]:
+        locations = [at for at, names in effect.locations.items() if not {*names}.isdisjoint(space.names)]
+        joints = [at for at in locations if at in scene.single_joints]
+        if without_row := [j for j in joints if scene.model.dof_frictionloss[scene.dof(j)] <= 0]:
             raise ValueError(
-                f"effect {effect.name!r} raises dry friction of {', '.join(without)}, which scene {scene.name!r} "
+                f"effect {effect.name!r} raises dry friction of {', '.join(without_row)}, which scene {scene.name!r} "
                 "compiled without any, so it would change nothing: use registry.ready(scene) in its place "
                 "(droid_jax.model.effects.registry)"
             )
 
 
 def without_unused(space: Space, recordings: Sequence[Recording]) -> Space:
-    """The space less parameters that stand for others where none of these recordings says so."""
+    """Return the space without parameters that stand for others in none of these recordings."""
     named = {value for recording in recordings for value in recording.known.values()}
     return Space(tuple(p for p in space.parameters if p.role is not Role.STANDS_FOR or p.name in named))
 
 
 def _warn_of_commanded(space: Space) -> None:
-    """Warn of parameters that act through commands or constraints, where no recording has any: they change nothing."""
-    idle = [
+    """Warn of parameters that act through commands or constraints if no recording has commands: they have no effect."""
+    without_effect = [
         p.name
         for p in space.parameters
         if p.role is Role.TIME_OFFSET
         or (p.writes and all(w.field.startswith(("actuator_", "dof_sol")) for w in p.writes))
     ]
-    if idle:
+    if without_effect:
         warnings.warn(
-            f"parameters {', '.join(idle)} change nothing where no recording holds commands: its motion is prescribed",
+            f"parameters {', '.join(without_effect)} change nothing where no recording holds commands: its motion is "
+            "prescribed",
             stacklevel=3,
         )
 
@@ -287,7 +300,7 @@ def assemble(
     replays: Sequence[Callable[[np.ndarray], Rollout]],
     drives: Sequence[Drive | Motion],
 ) -> Cost:
-    """A Cost from batch replays ([B, D] -> Rollout), what each is compared with, and what each follows."""
+    """Return a Cost of batch replays ([B, D] -> Rollout), with the comparison and the drive or motion of each."""
     return Cost(
         scene=scene,
         space=space,
@@ -303,8 +316,8 @@ def assemble(
 
 
 def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive | Motion:
-    """What a replay follows: the recording's commands or, where it holds none, its measured motion."""
-    validate(recording, allow_jitter=True)  # one made in Python may not have been
+    """Return what a replay follows: the recording's commands or, if there are none, its measured motion."""
+    validate(recording, allow_jitter=True)  # a recording that was made in Python may be invalid
     check_range(scene, recording)
     if recording.command.size:
         drive = make_drive(scene, recording, weigh="torque" in config.channels, config=config.start)
@@ -313,10 +326,10 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
         return drive
     if not scene.joints:
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
-    felt = (*scene.joints, *scene.carriers(scene.joints))  # by the torques that are compared
+    relevant = (*scene.joints, *scene.carriers(scene.joints))  # joints whose motion enters the compared torques
     cutoff = config.motion_cutoff
     joints = prescribed(scene, recording, cutoff)
-    return measured_motion(recording, joints, cutoff=cutoff, alike=felt, rest=config.rest)
+    return measured_motion(recording, joints, cutoff=cutoff, alike=relevant, rest=config.rest)
 
 
 def _from_one_start(
@@ -339,18 +352,19 @@ def _from_one_start(
 def _compared(
     scene: Scene, space: Space, recording: Recording, follows: Drive | Motion, replay: Callable, config: CompareConfig
 ) -> Comparison:
-    """What a recording is compared with its replay by."""
-    apart = _apart(replay, scene, recording, config) if isinstance(replay, Along) else None
+    """The comparison of a recording with its replay."""
+    motion_torques = _motion_torques(replay, scene, recording, config) if isinstance(replay, Along) else None
     recording = _from_one_start(scene, space, recording, follows, replay, config.start)
     rest = follows.rest if isinstance(follows, Motion) else None
-    return make_comparison(scene, recording, replay_clock(recording, follows), config, apart, rest)
+    return make_comparison(scene, recording, replay_clock(recording, follows), config, motion_torques, rest)
 
 
-def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
-    """[N, T, J] N m: torques of the repeats' own measured motions, less their mean; None unless each measured its own.
+def _motion_torques(along: Along, scene: Scene, recording: Recording, config: CompareConfig) -> np.ndarray | None:
+    """[N, T, J] N m, torques of the repeats' own measured motions minus their mean.
 
-    A replay follows the mean of the measured positions, whose noise, differentiated twice, all repeats share.  What
-    the repeats' own motions would take tells how large it is (errors in variables).
+    None for one repeat, or where positions are missing.  A replay follows the mean of the measured positions.  The
+    noise of that mean, differentiated twice, is common to all repeats.  Its size shows in how much the torques of the
+    repeats' own motions differ (errors in variables).
     """
     if recording.repeats == 1 or not recording.channel("position").mask.all():
         return None
@@ -365,42 +379,43 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
     return torques - torques.mean(axis=0)
 
 
-def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
-    """Whether what was compiled for the one serves the other, from its own start."""
+def _same_program(new: Drive | Motion, old: Drive | Motion) -> bool:
+    """Whether a replay compiled for `old` can replay `new`, which may start elsewhere."""
     if new.torque != old.torque:
         return False
     if isinstance(new, Motion) and isinstance(old, Motion):
         return new.joints == old.joints and np.array_equal(new.time, old.time)
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
-    sent, before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
-    return np.array_equal(sent, before) and np.array_equal(new.command[:, sent], old.command[:, sent])
+    sent, sent_before = (np.ones(d.command.shape[1], bool) if d.sent is None else d.sent for d in (new, old))
+    return np.array_equal(sent, sent_before) and np.array_equal(new.command[:, sent], old.command[:, sent])
 
 
-def _start_alike(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
-    """Whether two drives have the same gains and known values and start at one place, but for `alike`; motions, which
-    are followed as they are, never do.
+def _same_start(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: StartConfig) -> bool:
+    """Whether two drives have the same gains and known values, and start within `config.alike` of each other.
 
-    An object that stands ajar by about `ajar` is put back for some repeats and not for others.
+    False for motions.  An object that is ajar by about `config.ajar` is reset to shut for some repeats and not for
+    others, so the tolerance of its joint is larger by `ajar`.
     """
     if isinstance(new, Motion) or isinstance(old, Motion):
         return False
     if new.known != old.known or not np.array_equal(servo_factors(scene, new), servo_factors(scene, old)):
         return False
-    apart = np.full(scene.model.nq, config.alike)
+    tolerance = np.full(scene.model.nq, config.alike)
     if scene.object_joint and scene.object_joint not in scene.joints:
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
-            apart[hinge] += config.ajar
-    apart[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf  # by as much as what has them there
-    return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= apart))
+            tolerance[hinge] += config.ajar
+    # Positions that follow from others differ as much as those do.
+    tolerance[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf
+    return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= tolerance))
 
 
 def replay_clock(recording: Recording, follows: Drive | Motion) -> np.ndarray:
-    """[T] s of a replay's rows, on the recording's clock."""
+    """Return times [T] s of a replay's rows, on the recording's clock."""
     return follows.time if isinstance(follows, Motion) else float(recording.time[0]) + follows.time
 
 
 def _compiled(function: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
-    """Of one row of a batch of Rollouts -> of all, in one compiled piece."""
+    """A function of one Rollout, vmapped over a batch [P, ...] and compiled."""
     return jax.jit(jax.vmap(runtime.in_full(function)), compiler_options=runtime.compiler_options())

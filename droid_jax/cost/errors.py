@@ -1,6 +1,6 @@
-"""How far a replay is from what was measured: mean absolute and RMS error of each channel and joint, as measured.
+"""Mean absolute and RMS error of a replay against the measurement, for each channel and joint.
 
-Open loop over the whole motion, without filter, in physical units: the numbers that people know from their plots.
+The replay is open loop over the whole motion.  The errors are in physical units, and nothing is filtered.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from droid_jax.storage import finite
 class ChannelErrors:
     """Errors of one measured channel of one recording, before and after a fit; NaN where a replay blew up.
 
-    unit: of all numbers.  joints: [C].  mae_*, rms_*: [C] mean absolute and root mean square of simulated less
-    measured, over all repeats and samples that were measured.
+    unit: of all numbers.  joints: [C] names.  mae_*, rms_*: [C] mean absolute and root mean square of simulated minus
+    measured values, over all measured samples of all repeats.
     """
 
     unit: str
@@ -43,32 +43,35 @@ class ChannelErrors:
 def channel_errors(
     scene: Scene, recording: Recording, clock: np.ndarray, before: Rollout, after: Rollout
 ) -> dict[str, ChannelErrors]:
-    """Errors by channel, of all that were measured of the scene's joints.
+    """Return the errors of every measured channel of the scene's joints, by channel name.
 
     Args:
         scene: the simulated one.
-        recording: what was measured, N repeats.
+        recording: the measurement, N repeats.
         clock: [T] s, times of the replay's rows on the recording's clock.
         before: the replay at the initial means, host arrays of one sample, [T, J].
-        after: at the fitted values.
+        after: the same at the fitted values.
+
+    Returns:
+        Errors by channel name.  A channel is left out where a column has no measured sample during the replay.
     """
-    found = dict[str, ChannelErrors]()
+    out = dict[str, ChannelErrors]()
     for name in measured_channels(scene, recording):
-        channel = recording.channels[name]
-        kept = within(of_scene(scene, channel), clock)
-        unit = channel_unit(scene, name, kept.columns, channel.unit)
-        left = [simulated_channel(scene, kept, clock, rollout)[None] - kept.values for rollout in (before, after)]
-        if not kept.mask.any(axis=(0, 1)).all():
+        recorded = recording.channels[name]
+        channel = within(of_scene(scene, recorded), clock)
+        unit = channel_unit(scene, name, channel.columns, recorded.unit)
+        errors = [simulated_channel(scene, channel, clock, r)[None] - channel.values for r in (before, after)]
+        if not channel.mask.any(axis=(0, 1)).all():
             continue
-        mae = [_mean(np.abs(e), kept.mask) for e in left]
-        rms = [np.sqrt(_mean(e**2, kept.mask)) for e in left]
+        mae = [_mean(np.abs(e), channel.mask) for e in errors]
+        rms = [np.sqrt(_mean(e**2, channel.mask)) for e in errors]
         numbers = [tuple(row.tolist()) for row in (*mae, *rms)]
-        found[name] = ChannelErrors(unit, kept.columns, *numbers)
-    return found
+        out[name] = ChannelErrors(unit, channel.columns, *numbers)
+    return out
 
 
 def of_scene(scene: Scene, channel: Channel) -> Channel:
-    """A channel's columns that the scene simulates; the object's angle has one."""
+    """Return a channel with the columns that the scene simulates; the object's angle stays unchanged."""
     if channel.name == "object_angle":
         return channel
     columns = [i for i, joint in enumerate(channel.columns) if joint in scene.joints]
@@ -81,14 +84,17 @@ def of_scene(scene: Scene, channel: Channel) -> Channel:
 
 
 def within(channel: Channel, clock: np.ndarray) -> Channel:
-    """A channel's samples inside the time [T] s of a replay."""
+    """Return a channel with its samples inside the time `clock` [T] s of a replay."""
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     cut = {"time": channel.time[inside], "values": channel.values[:, inside], "mask": channel.mask[:, inside]}
     return replace(channel, **cut)
 
 
 def channel_unit(scene: Scene, name: str, joints: Sequence[str], unit: str) -> str:
-    """Unit of a channel of these joints in this scene, "rad or m" where some of them slide; `unit` of an object's."""
+    """Return the unit of a channel of these joints, "rad or m" where hinges and slides are mixed.
+
+    unit: what the recording states; it is returned for the object's angle.
+    """
     if name == "object_angle":
         return unit
     if name == "torque":
@@ -98,7 +104,7 @@ def channel_unit(scene: Scene, name: str, joints: Sequence[str], unit: str) -> s
 
 
 def simulated_channel(scene: Scene, channel: Channel, clock: np.ndarray, rollout: Rollout) -> np.ndarray:
-    """[Tc, C] the simulated counterpart of a channel of `of_scene`, at the channel's times."""
+    """Return the simulated counterpart [Tc, C] of a channel of `of_scene`, at the channel's times."""
     if channel.name not in SIMULATED:
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(SIMULATED)}")
     trace = np.asarray(getattr(rollout, channel.name), np.float64)
@@ -107,16 +113,16 @@ def simulated_channel(scene: Scene, channel: Channel, clock: np.ndarray, rollout
 
 
 def sample_of(rollouts: Rollout, row: int) -> Rollout:
-    """One sample of a batch [P, ...]."""
+    """Return sample `row` of a batch of rollouts [P, ...]."""
 
-    def of(traces: Any) -> Any:
+    def of_row(traces: Any) -> Any:
         return traces[row]
 
-    return jax.tree.map(of, rollouts)
+    return jax.tree.map(of_row, rollouts)
 
 
 def errors_json(errors: Mapping[str, ChannelErrors]) -> dict[str, Any]:
-    """Errors by channel as plain data, None where a replay blew up."""
+    """Return errors by channel as plain data, None where a replay blew up."""
 
     def plain(value: Any) -> Any:
         return [finite(v) if isinstance(v, float) else v for v in value] if isinstance(value, tuple) else value
@@ -125,9 +131,11 @@ def errors_json(errors: Mapping[str, ChannelErrors]) -> dict[str, Any]:
 
 
 def mean_errors(errors: Mapping[str, Mapping[str, ChannelErrors]]) -> dict[str, tuple[float, float]]:
-    """By channel the mean absolute error before and after, over joints and then over the recordings that hold it.
+    """Return the mean absolute error before and after the fit, by channel.
 
-    errors: by recording, by channel.
+    It is averaged over joints, then over the recordings that hold the channel.
+
+    errors: by recording name, by channel name.
     """
     names = dict.fromkeys(name for of in errors.values() for name in of)
     pairs = {name: [of[name].mean_mae for of in errors.values() if name in of] for name in names}
@@ -135,5 +143,5 @@ def mean_errors(errors: Mapping[str, Mapping[str, ChannelErrors]]) -> dict[str, 
 
 
 def _mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """[C] mean of values [N, T, C] over what was measured."""
+    """[C] mean of values [N, T, C] over the measured samples."""
     return np.where(mask, values, 0.0).sum(axis=(0, 1)) / mask.sum(axis=(0, 1))

@@ -1,6 +1,6 @@
-"""One repeat of a commanded recording as part of a `WindowedLog`: its windows, or its motion whole.
+"""One repeat of a commanded recording as part of a `WindowedLog`: its windows, or its full motion.
 
-A whole motion is one window that lasts as long.  What shares a program is replayed in one batch.
+A full motion is one window of the motion's length.  Pieces with one compiled program are replayed in one batch.
 """
 
 from __future__ import annotations
@@ -26,23 +26,29 @@ from droid_jax.simulate.replay import Drive, end_on
 from droid_jax.simulate.servo_gains import servo_factors
 from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
 
-STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
-LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
-ALIKE = 1.01  # the same where sensors err with time, centred on the replay's clock: what is added would be an offset
-MANY = 8  # windows of a sample from which its batches always have many rows
-TRACES = ("torque", "position", "velocity", "object_angle")
+STRETCH_SECONDS = 0.5  # length of the stretches of a full motion, which are units of the tests as windows are
+# Motions of different lengths share one compiled program of the longest one.  A motion may be replayed for at most so
+# many times its own duration.
+LONGEST_RATIO = 1.25
+LONGEST_RATIO_OVER_TIME = (
+    1.01  # for sensor errors that vary with time about the replay's middle: longer ones add offset
+)
+MANY_WINDOWS = 8  # windows of a sample from which on blocks of rows are large also for few samples
+TRACES = ("torque", "position", "velocity", "object_angle")  # channels of a Rollout
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One repeat of one recording: W windows, or one that is the whole motion.
+    """One repeat of one recording: W windows, or its full motion as one window.
 
-    program: of the windows (`compiled.window_program`).
-    kernels: of windows, by channel [W, 1 or C, K, T], what its data went through.  filters: of a whole motion the same,
-    1 or C of [K, T].  columns: by channel [C] of the simulated one.
-    measured: [W, K, all C].  at: [W, K] s, the instants on the recording's clock.  rows: [W, K] of the replay, nearest.
-    unit: [W, K] window, or stretch of a whole motion, that an instant is in.
-    stated: rows [..., D] with what is known in this recording in place (`Space.with_known`).
+    name: of the recording, and the number of the repeat.  windows: their commands and start states.
+    program: replays the windows (`compiled.window_program`).
+    kernels: by channel [W, 1 or C, K, T], the filter of the windows' data; empty for a full motion.
+    filters: by channel 1 or C matrices [K, T], the same of a full motion; empty for windows.
+    columns: by channel [C] of the simulated channel.  measured: [W, K, all C] filtered data of all channels.
+    at: [W, K] s, the instants on the recording's clock.  rows: [W, K] nearest rows of the replay.
+    unit: [W, K] number of the window, or of the stretch of a full motion, of each instant.
+    stated: vectors [..., D] -> the same with the values that this recording states (`Space.with_known`).
     """
 
     name: str
@@ -59,60 +65,75 @@ class Piece:
 
     @property
     def count(self) -> int:
-        """W."""
+        """Number W of windows."""
         return len(self.at)
 
     @property
-    def whole(self) -> bool:
-        """Whether its motion is replayed from its beginning."""
+    def full_motion(self) -> bool:
+        """Whether the motion is replayed as a whole from its beginning."""
         return bool(self.filters)
 
-    def smoothed(self, rollout: Rollout, which: np.ndarray) -> dict[str, np.ndarray]:
-        """ "smooth": [R, K, all C] the compared channels through the filter of their data; NaN where it blew up."""
+    def smoothed(self, rollout: Rollout, window: np.ndarray) -> dict[str, np.ndarray]:
+        """Return {"smooth": [R, K, all C]}, the compared channels through the filter of their data.
+
+        NaN where the replay blew up.
+
+        rollout: [R, T, ...].  window: [R] number of each row's window.
+        """
         parts = []
         for name, columns in self.columns.items():
             trace = getattr(rollout, name)
             trace = (trace[..., None] if trace.ndim == 2 else trace)[..., columns]
-            if self.whole:
+            if self.full_motion:
                 each = self.filters[name] * (trace.shape[2] if len(self.filters[name]) == 1 else 1)
                 parts.append(np.stack([(f @ trace[:, :, c].T).T for c, f in enumerate(each)], axis=2))
                 continue
-            own = self.kernels[name][which]  # [R, 1 or C, K, T]
+            kernels = self.kernels[name][window]  # [R, 1 or C, K, T]
             parts.append(
-                own[:, 0] @ trace if own.shape[1] == 1 else np.einsum("rckt,rtc->rkc", own, trace, optimize=True)
+                kernels[:, 0] @ trace
+                if kernels.shape[1] == 1
+                else np.einsum("rckt,rtc->rkc", kernels, trace, optimize=True)
             )
         smooth = np.concatenate(parts, axis=2).astype(np.float64)
         smooth[~rollout.finite.astype(bool)] = np.nan
         return {"smooth": smooth}
 
-    def traces(self, rollout: Rollout, which: np.ndarray) -> dict[str, np.ndarray]:
-        """The simulated channels at the instants, [R, K, ...], and "finite" [R]."""
-        rows = self.rows[which]
-        of = np.arange(len(rows))[:, None]
-        return {**{name: getattr(rollout, name)[of, rows] for name in TRACES}, "finite": rollout.finite.astype(bool)}
+    def traces(self, rollout: Rollout, window: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the simulated channels at the instants by name, [R, K, ...], and "finite" [R].
+
+        rollout: [R, T, ...].  window: [R] number of each row's window.
+        """
+        rows = self.rows[window]
+        index = np.arange(len(rows))[:, None]
+        return {**{name: getattr(rollout, name)[index, rows] for name in TRACES}, "finite": rollout.finite.astype(bool)}
 
     def spread(self, values: np.ndarray) -> np.ndarray | None:
-        """[W, K, all C, 2 nv] what each column of the states' spread does to the simulation at `values` [D].
+        """Return the change [W, K, all C, 2 nv] of the simulation by each column of the start states' spread.
 
-        None where there is none.
+        The columns of `Windows.spread` are a square root of the covariance of the start states.  The changes are
+        central differences at `values` [D].  None where the start states have no spread.
         """
         windows = self.windows
         if not windows.spread.any():
             return None
         dofs, positions = windows.speed.shape[1], windows.start.shape[1]
-        assert dofs == positions  # joints of one degree, in one order
+        assert dofs == positions  # only hinges and slides, whose positions and speeds have the same order
         columns = 2 * dofs
-        which = np.repeat(np.arange(self.count), columns)
-        step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # one row for each column
-        rows, own = np.repeat(self.stated(values)[None], len(which), axis=0), np.arange(len(which))
+        window = np.repeat(np.arange(self.count), columns)
+        step = np.swapaxes(windows.spread, 1, 2).reshape(-1, columns)  # a row for each window and column
+        rows, every = np.repeat(self.stated(values)[None], len(window), axis=0), np.arange(len(window))
         ends = list[np.ndarray]()
-        for s in (1.0, -1.0):
-            start, speed = windows.start[which] + s * step[:, :dofs], windows.speed[which] + s * step[:, dofs:]
-            given = [(windows.table, which), (start, own), (windows.gains, which), (speed, own), (windows.begin, which)]
-            parts = [self.smoothed(r, which[of])["smooth"] for r, of in _blocks(self.program, rows, given, self.count)]
-            ends.append(np.concatenate(parts))
-        found = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
-        return np.moveaxis(found, 1, -1)
+        for sign in (1.0, -1.0):
+            start = windows.start[window] + sign * step[:, :dofs]
+            speed = windows.speed[window] + sign * step[:, dofs:]
+            inputs = [
+                (windows.table, window), (start, every), (windows.gains, window), (speed, every),
+                (windows.begin, window),
+            ]  # fmt: skip
+            blocks = _blocks(self.program, rows, inputs, self.count)
+            ends.append(np.concatenate([self.smoothed(rollout, window[of])["smooth"] for rollout, of in blocks]))
+        change = np.nan_to_num(0.5 * (ends[0] - ends[1])).reshape(self.count, columns, *ends[0].shape[1:])
+        return np.moveaxis(change, 1, -1)
 
 
 def replayed(
@@ -121,47 +142,55 @@ def replayed(
     reduce: Callable[[Piece, Rollout, np.ndarray], dict[str, np.ndarray]],
     active: Sequence[np.ndarray] | None = None,
 ) -> list[dict[str, np.ndarray]]:
-    """What `reduce` makes of a piece's Rollout [R, T, ...] and the windows [R] it is of, for samples [P, D].
+    """Replay the windows of all pieces for samples [P, D], and return a reduction of the rollouts of each piece.
 
-    active: by piece, windows [W] bool that are replayed; None: all.  Pieces that share a program share its blocks.
-    Returns, by piece, arrays [P, active windows, ...]; nothing for a piece without any.
+    Pieces that share a program share its blocks of rows.
+
+    Args:
+        pieces: of a log.
+        values: [P, D].
+        reduce: (piece, Rollout [R, T, ...], numbers [R] of the rows' windows) -> named arrays [R, ...].
+        active: by piece, windows [W] bool to replay; None for all.
+
+    Returns:
+        By piece, named arrays [P, active windows, ...]; empty for a piece without active windows.
     """
-    shared = dict[int, list[int]]()
+    of_program = dict[int, list[int]]()
     for i, piece in enumerate(pieces):
-        shared.setdefault(id(piece.program), []).append(i)
-    found = list[dict[str, np.ndarray]]({} for _ in pieces)
-    for members in shared.values():
+        of_program.setdefault(id(piece.program), []).append(i)
+    out = list[dict[str, np.ndarray]]({} for _ in pieces)
+    for members in of_program.values():
         chosen = [np.arange(pieces[i].count) if active is None else np.flatnonzero(active[i]) for i in members]
         if not sum(map(len, chosen)):
             continue
-        run = functools.partial(_together, [pieces[i] for i in members], chosen, reduce)
+        run = functools.partial(_replayed_together, [pieces[i] for i in members], chosen, reduce)
         for i, part in zip(members, distributed.over_processes(run, values), strict=True):
-            found[i] = part
-    return found
+            out[i] = part
+    return out
 
 
-def _together(
+def _replayed_together(
     pieces: Sequence[Piece],
     chosen: Sequence[np.ndarray],
     reduce: Callable[[Piece, Rollout, np.ndarray], dict[str, np.ndarray]],
     values: np.ndarray,
 ) -> list[dict[str, np.ndarray]]:
-    """As `replayed`, of pieces of one program and their chosen windows."""
+    """The same as `replayed` for pieces of one program; chosen: numbers of the active windows of each."""
     count, each = len(values), sum(map(len, chosen))
     piece, window = np.repeat(np.arange(len(pieces)), list(map(len, chosen))), np.concatenate(chosen)
     piece, window = np.tile(piece, count), np.tile(window, count)
     first = np.cumsum([0, *(p.count for p in pieces)])[:-1]
     names, pick = ("table", "start", "gains", "speed", "begin"), first[piece] + window
-    given = [(np.concatenate([getattr(p.windows, name) for p in pieces]), pick) for name in names]
+    inputs = [(np.concatenate([getattr(p.windows, name) for p in pieces]), pick) for name in names]
     parts = list[list[dict[str, np.ndarray]]]([] for _ in pieces)
     rows = np.repeat(values, each, axis=0)
     for i, one in enumerate(pieces):
         rows[piece == i] = one.stated(rows[piece == i])
-    for rollout, of in _blocks(pieces[0].program, rows, given, each):
-        for i in np.unique(piece[of]).tolist():
-            mine = piece[of] == i
-            some = rollout if mine.all() else Rollout(*(getattr(rollout, f.name)[mine] for f in fields(rollout)))
-            parts[i].append(reduce(pieces[i], some, window[of][mine]))
+    for rollout, block in _blocks(pieces[0].program, rows, inputs, each):
+        for i in np.unique(piece[block]).tolist():
+            mine = piece[block] == i
+            own = rollout if mine.all() else Rollout(*(getattr(rollout, f.name)[mine] for f in fields(rollout)))
+            parts[i].append(reduce(pieces[i], own, window[block][mine]))
     return [
         {k: np.concatenate([p[k] for p in part]).reshape(count, len(w), *part[0][k].shape[1:]) for k in part[0]}
         if part
@@ -171,29 +200,33 @@ def _together(
 
 
 def _blocks(
-    program: Callable[..., Rollout], values: np.ndarray, given: Sequence[tuple[np.ndarray, np.ndarray]], each: int
+    program: Callable[..., Rollout], values: np.ndarray, inputs: Sequence[tuple[np.ndarray, np.ndarray]], each: int
 ) -> Iterator[tuple[Rollout, np.ndarray]]:
-    """The Rollouts of rows [R, D] and of what else a program takes, block by block, on the host, and which they are.
+    """Replay rows block by block; yield each block's Rollout on the host, and the numbers of its rows.
 
-    given: arrays, and which of their entries [R] the rows take: a table for each would not fit into memory.
-    each: rows that every sample has.
+    values: [R, D].  inputs: the program's other arrays, each with the number [R] of the entry that a row takes, since
+    a copy for each row would not fit into memory.  each: number of rows of a sample.
     """
-    size = block_size(len(values), each >= MANY)
+    size = block_size(len(values), each >= MANY_WINDOWS)
     for first in range(0, len(values), size):
         rows = np.minimum(np.arange(first, first + size), len(values) - 1)  # the last block repeats its last row
         count = min(size, len(values) - first)
-        rollout = program(values[rows], *(np.asarray(a[pick[rows]], np.float32) for a, pick in given))
+        rollout = program(values[rows], *(np.asarray(a[pick[rows]], np.float32) for a, pick in inputs))
         yield Rollout(*(np.asarray(getattr(rollout, f.name))[:count] for f in fields(rollout))), rows[:count]
 
 
 def shared_steps(steps: Sequence[int], effects: Sequence[Effect] = ()) -> list[int]:
-    """How long each of some motions is replayed, at least its own steps: few different numbers."""
-    longer = ALIKE if any(e.over_time and e.observe is not None for e in effects) else LONGER
-    found, longest = [0] * len(steps), 0
+    """Return the number of steps to replay each motion for, at least its own, so that few numbers are different.
+
+    steps: of each motion.  effects: in the replays.
+    """
+    over_time = any(e.over_time and e.observe is not None for e in effects)
+    ratio = LONGEST_RATIO_OVER_TIME if over_time else LONGEST_RATIO
+    out, longest = [0] * len(steps), 0
     for i in sorted(range(len(steps)), key=lambda i: -steps[i]):
-        longest = longest if steps[i] <= longest <= longer * steps[i] else steps[i]
-        found[i] = longest
-    return found
+        longest = longest if steps[i] <= longest <= ratio * steps[i] else steps[i]
+        out[i] = longest
+    return out
 
 
 def in_windows(
@@ -208,27 +241,33 @@ def in_windows(
     grid: float | None,
     number: int = 0,
 ) -> Piece | None:
-    """A repeat in windows, without those in which something was not measured; see `windowed_log`.  None: in all."""
+    """Return a repeat in windows, without windows in which a sample is missing; None if no window remains.
+
+    number: of the first window among those of all pieces, which sets where sampled windows lie.  For the other
+    arguments see `windowed_log`.
+    """
     if any(effect.profile is not None for effect in effects):
         windows = replace(windows, history=max(windows.history, windows.past))
-    made = cut(scene, recording, drive, repeat, windows, grid, number)
-    if not len(made.begin):
+    every = cut(scene, recording, drive, repeat, windows, grid, number)
+    if not len(every.begin):
         return None
     instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate
-    clocks, at = made.begin[:, None] + np.arange(made.steps) * drive.timestep, made.begin[:, None] + windows.lead
+    clocks, at = every.begin[:, None] + np.arange(every.steps) * drive.timestep, every.begin[:, None] + windows.lead
     at = at + instants
-    values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
-    kept = np.asarray(~np.isnan(values).any(axis=(1, 2)))
-    program = window_program(scene, space, drive, effects, made.earlier, made.steps)
-    kernels = {key: _dense(each)[kept] for key, each in passed.items()}
+    values, filters, columns = _measured(scene, recording, repeat, config, clocks, at)
+    complete = np.asarray(~np.isnan(values).any(axis=(1, 2)))
+    program = window_program(scene, space, drive, effects, every.earlier, every.steps)
+    kernels = {key: _dense(each)[complete] for key, each in filters.items()}
     unit = np.repeat(np.arange(len(at))[:, None], at.shape[1], axis=1)
-    cut_to = (a[kept] for a in (values, at, _nearest(at, clocks, drive), unit))
+    of_windows = (a[complete] for a in (values, at, _nearest(at, clocks, drive), unit))
     stated = functools.partial(space.with_known, drive.known)
-    stated(space.mean)  # refused here, not at the first call
-    return Piece(_name(recording, repeat), made.kept(kept), program, kernels, {}, columns, *cut_to, stated=stated)
+    stated(space.mean)  # raises here for wrong stated values, not at the first replay
+    return Piece(
+        _name(recording, repeat), every.kept(complete), program, kernels, {}, columns, *of_windows, stated=stated
+    )
 
 
-def as_a_whole(
+def as_full_motion(
     scene: Scene,
     space: Space,
     recording: Recording,
@@ -240,11 +279,20 @@ def as_a_whole(
     steps: int,
     grid: float | None,
 ) -> Piece:
-    """A repeat from its beginning, without instants that were not measured.
+    """Return a repeat's full motion from its beginning, without instants at which a sample is missing.
 
-    steps: how many are replayed.  grid: s, the time step whose last instant is the last one compared; None: its
-    own.  windows: `lead` of the beginning is not compared; `reach` tells how far the start may be off, but not where an
-    object is gripped, whose contacts change with it.
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recording: with commands.
+        repeat: its number.
+        drive: what the replay follows.
+        config: how simulation and measurement are compared.
+        windows: the first `lead` seconds are not compared.  `reach` sets the spread of the start state, which is zero
+            where an object is gripped, since its contacts change with it.
+        effects: in the replay.
+        steps: number of replayed steps.
+        grid: s, time step whose last instant is the last one compared; None for the scene's.
     """
     begin = float(recording.time[0])
     end = end_on(recording, grid or drive.timestep)
@@ -253,11 +301,11 @@ def as_a_whole(
         begin + np.arange(steps)[None] * drive.timestep,
         coarse_clock(begin + windows.lead, last, config.noise.rate)[None],
     )
-    values, passed, columns = _measured(scene, recording, repeat, config, clocks, at)
-    kept = ~np.isnan(values[0]).any(axis=1)
-    unit = np.floor((at - at[0, 0]) / STRETCH).astype(int)
-    unit = np.minimum(unit, max(int((at[0, -1] - at[0, 0]) / STRETCH) - 1, 0))
-    filters = {key: tuple(f[kept] for f in each[0]) for key, each in passed.items()}
+    values, of_channels, columns = _measured(scene, recording, repeat, config, clocks, at)
+    complete = ~np.isnan(values[0]).any(axis=1)
+    unit = np.floor((at - at[0, 0]) / STRETCH_SECONDS).astype(int)
+    unit = np.minimum(unit, max(int((at[0, -1] - at[0, 0]) / STRETCH_SECONDS) - 1, 0))
+    filters = {key: tuple(f[complete] for f in each[0]) for key, each in of_channels.items()}
     table = np.concatenate([drive.command, np.repeat(drive.command[-1:], steps - len(drive.command), axis=0)])
     size = scene.model.nv
     spread = np.zeros((2 * size, 2 * size))
@@ -268,25 +316,29 @@ def as_a_whole(
         spread[None], 0, steps,
     )  # fmt: skip
     program = window_program(scene, space, drive, effects, 0, steps)
-    cut_to = (a[:, kept] for a in (values, at, _nearest(at, clocks, drive), unit))
+    of_motion = (a[:, complete] for a in (values, at, _nearest(at, clocks, drive), unit))
     stated = functools.partial(space.with_known, drive.known)
-    stated(space.mean)  # refused here, not at the first call
-    return Piece(_name(recording, repeat), motion, program, {}, filters, columns, *cut_to, stated=stated)
+    stated(space.mean)  # raises here for wrong stated values, not at the first replay
+    return Piece(_name(recording, repeat), motion, program, {}, filters, columns, *of_motion, stated=stated)
 
 
 def _measured(
     scene: Scene, recording: Recording, repeat: int, config: CompareConfig, clocks: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, dict[str, list[tuple[sparse.csr_array, ...]]], dict[str, np.ndarray]]:
-    """[W, K, all C] what was measured at instants `at` [W, K]; its filters for replays with rows `clocks` [W, T], and
-    the simulated columns, by channel.  NaN where too little was measured."""
+    """The smoothed measurement of a repeat's windows, with the filters of the simulated traces.
+
+    clocks: [W, T] s, times of the replays' rows.  at: [W, K] s, instants.
+    Returns values [W, K, all C], NaN where too little was measured; by channel the filters of each window; and by
+    channel the simulated columns [C].
+    """
     columns, measured = dict[str, np.ndarray](), list[np.ndarray]()
-    passed = dict[str, list[tuple[sparse.csr_array, ...]]]()
+    filters = dict[str, list[tuple[sparse.csr_array, ...]]]()
     for name in config.channels:
         channel, columns[name] = compared_columns(scene, recording.channel(name), config.noise)
         each = [in_window(channel, repeat, *both, config.noise) for both in zip(clocks, at, strict=True)]
         measured.append(np.stack([values for values, _ in each]))
-        passed[name] = [filters for _, filters in each]
-    return np.concatenate(measured, axis=2), passed, columns
+        filters[name] = [of_window for _, of_window in each]
+    return np.concatenate(measured, axis=2), filters, columns
 
 
 def _name(recording: Recording, repeat: int) -> str:
@@ -294,11 +346,12 @@ def _name(recording: Recording, repeat: int) -> str:
 
 
 def _nearest(at: np.ndarray, clocks: np.ndarray, drive: Drive) -> np.ndarray:
+    """[W, K] rows of the replays that are nearest to instants `at` [W, K]."""
     return np.clip(np.rint((at - clocks[:, :1]) / drive.timestep).astype(int), 0, clocks.shape[1] - 1)
 
 
 def _dense(each: Sequence[tuple[sparse.csr_array, ...]]) -> np.ndarray:
-    """[W, 1 or C, K, T] of every window's filters."""
-    wide = max(len(filters) for filters in each)
-    written = [np.stack([f.toarray() for f in filters]) for filters in each]
-    return np.stack([np.broadcast_to(w, (wide, *w.shape[1:])) for w in written]).astype(np.float32)
+    """[W, 1 or C, K, T] dense array of every window's filters."""
+    count = max(len(filters) for filters in each)
+    dense = [np.stack([f.toarray() for f in filters]) for filters in each]
+    return np.stack([np.broadcast_to(d, (count, *d.shape[1:])) for d in dense]).astype(np.float32)

@@ -1,7 +1,7 @@
 """The cost of one log: a recording of one repeat without commands, replayed by inverse dynamics.
 
-Its noise is stated, not estimated, and its residuals are whitened on the host, so that other data, another noise or
-fewer instants compile nothing again.
+Its noise is stated, not estimated from repeats.  Its residuals are whitened on the host, so that other data, another
+noise or fewer instants need no new compilation.
 """
 
 from __future__ import annotations
@@ -25,41 +25,38 @@ from droid_jax.simulate.measured_motion import Motion
 
 @dataclass(frozen=True, eq=False)
 class LoneLog(Cost):
-    """The cost of one recording of one repeat, whitened on the host.
-
-    Other data, another noise or fewer instants then compile nothing again.
-    """
+    """The cost of a recording of one repeat without commands, whitened on the host."""
 
     def whitened(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, M] residuals in units of the noise stated, zero at instants left out."""
+        """Return residuals [P, M] at values [P, D], in units of the stated noise; zero at instants without weight."""
         noise = self._torque.noise
         weight = np.einsum("ckk->kc", noise.whitener)
-        left = (self.simulated(values) - noise.mean) * weight
-        return np.swapaxes(left, 1, 2).reshape(len(left), -1)
+        residual = (self.simulated(values) - noise.mean) * weight
+        return np.swapaxes(residual, 1, 2).reshape(len(residual), -1)
 
     def simulated(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, K, C] simulated torques through the data's filter, in the channel's unit."""
+        """Return simulated torques [P, K, C] at values [P, D], through the data's filter, in the channel's unit."""
         return self.smoothed(values)[0].astype(np.float64)
 
     def distances(self, values: Any) -> np.ndarray:
-        """[P, D] -> [P, 1] equation 1 over the instants that count."""
+        """Return equation 1 [P, 1] at values [P, D], over the instants that have a weight."""
         (rollout,) = self.rollouts(values)
         comparison = self.comparisons[0]
         torque = self._torque
-        counts = np.any(np.einsum("ckk->kc", torque.noise.whitener) > 0, axis=1)
-        raw = comparison.clock[0] + torque.at * (comparison.clock[1] - comparison.clock[0])
-        places = (raw - self.clock[0]) / (self.clock[1] - self.clock[0])  # the clock is regular
-        near = np.clip(np.ceil(places - 0.5 - 1e-9).astype(int), 0, len(self.clock) - 1)
-        part = replace(comparison, channels=(replace(torque, mask=torque.mask & counts[near][:, None]),))
+        has_weight = np.any(np.einsum("ckk->kc", torque.noise.whitener) > 0, axis=1)
+        times = comparison.clock[0] + torque.at * (comparison.clock[1] - comparison.clock[0])
+        instants = (times - self.clock[0]) / (self.clock[1] - self.clock[0])  # the clock is regular
+        nearest = np.clip(np.ceil(instants - 0.5 - 1e-9).astype(int), 0, len(self.clock) - 1)
+        part = replace(comparison, channels=(replace(torque, mask=torque.mask & has_weight[nearest][:, None]),))
         return np.asarray(jax.vmap(part.distance)(rollout))[:, None]
 
     def part(self, name: str) -> LoneLog:
-        """The same log under a name for one part of it."""
+        """Return the same log under another name, that of a part of it."""
         return replace(self, comparisons=(replace(self.comparisons[0], name=name),))
 
     @property
     def columns(self) -> list[int]:
-        """[C] measured joint of each torque column."""
+        """[C] number of the scene's joint of each torque column."""
         return self._torque.columns.tolist()
 
     @property
@@ -74,24 +71,27 @@ class LoneLog(Cost):
 
     @property
     def moves(self) -> np.ndarray:
-        """[K, C] bool, instants at which each joint moves: at rest friction takes what is left."""
+        """[K, C] bool, instants at which each joint moves; at rest friction absorbs the residual."""
         return self._torque.moves
 
     def residual(self, values: np.ndarray) -> np.ndarray:
-        """[K, C] measured minus simulated torques of one vector [D]."""
+        """Return measured minus simulated torques [K, C] at one vector [D]."""
         return self.measured - self.simulated(values[None])[0]
 
     def least_noise(self) -> np.ndarray:
-        """[C] deviation below which the noise is never believed."""
+        """Return the smallest standard deviation [C] of the noise (`observation.least_noise`)."""
         return least_noise("torque", self.measured, self.comparisons[0].config.noise)
 
     def with_noise(self, deviation: np.ndarray, instants: np.ndarray) -> LoneLog:
-        """With noise of a deviation [C], in the channel's unit, at some instants [K] bool; the rest does not count."""
+        """Return the log with white noise, and weight at some instants only.
+
+        deviation: [C] standard deviation in the channel's unit.  instants: [K] bool, those that have a weight.
+        """
         noise = self._torque.noise.stated(np.maximum(deviation, self.least_noise()))
         return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
 
     def with_torques(self, torque: np.ndarray) -> LoneLog:
-        """With other measured torques [K, C] of the same motion."""
+        """Return the log with other measured torques [K, C] of the same motion."""
         return self._with(replace(self._torque.noise, mean=torque, repeats=torque[None]))
 
     @property
@@ -107,11 +107,17 @@ class LoneLog(Cost):
 def lone_log(
     scene: Scene, space: Space, recording: Recording, config: CompareConfig | None, effects: Sequence[Effect] = ()
 ) -> LoneLog:
-    """The cost of a log over a space.
+    """Return the cost of a log over a space.
+
+    Args:
+        scene: what is simulated.
+        space: meaning of the vectors [D].
+        recording: of one repeat, without commands.
+        config: how simulation and measurement are compared; None for the defaults.
+        effects: in the replay.
 
     Raises:
-        ValueError: repeats, which say more than blocks of time do; or commands: the discretisation error of a servo's
-            replay needs repeats.
+        ValueError: the recording has several repeats, or commands.
     """
     if recording.repeats > 1:
         raise ValueError(f"recording {recording.name!r} has {recording.repeats} repeats, and a log in blocks has one")

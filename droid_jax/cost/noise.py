@@ -1,7 +1,7 @@
-"""Repeat-to-repeat noise: one low-pass filter for data and simulation alike, its covariance, whitening.
+"""Repeat-to-repeat noise: the low-pass filter of data and simulation, the covariance of the noise, whitening.
 
-The filter is a linear map from a channel's clock to a coarse clock, so data of any rate and any
-mask and simulated traces pass through the same kernel.
+The filter is a linear map from a channel's clock to a coarse clock.  Data of any rate and any mask, and simulated
+traces, pass through the same kernel.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import scipy
 
 from droid_jax.arguments import check_fields, number, shown, weights, whole
 
-COARSEST = 0.9  # periods of the cutoff from one sample to the next; beyond, a window holds two of opposite signs
+LONGEST_STEP = 0.9  # largest step of a clock, periods of the cutoff; with longer ones the kernel's weights may cancel
 
 
 def _minimum() -> dict[str, float]:
@@ -24,24 +24,24 @@ def _minimum() -> dict[str, float]:
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """What decides the noise of a recording's channels, and with it the weights of its residuals.
+    """Settings of the noise model, which sets the weights of the residuals.
 
-    cutoff: Hz, of the low pass that data and simulation go through; real Panda residuals double between 8 and 20 Hz.
-    rate: Hz, of the coarse clock of what is smoothed; above twice the cutoff (Nyquist).
-    longest_lag: s, beyond it an autocovariance counts as noise of its estimate: ten repeats estimate a hundred lags
-      with nine degrees of freedom each, the weights then depend on the mean that they weigh, and p-values of nothing
-      are too small (tests/discrepancy/test_null_calibration.py).
+    cutoff: Hz, of the low pass for data and simulation; real Panda residuals double between 8 and 20 Hz.
+    rate: Hz, of the coarse clock of the smoothed channels; above twice the cutoff (Nyquist).
+    longest_lag: s, the autocovariance is tapered to zero there.  With more lags, ten repeats give p-values that are too
+      small under the null hypothesis (tests/discrepancy/test_null_calibration.py): each lag has nine degrees of
+      freedom, and the weights become correlated with the mean.
     shrinkage: share by which an autocovariance is shrunk towards white noise of the same variance.
-    least_window: share of the low pass's window that must be measured; the rest is renormalised, and its noise with it.
-    trend_repeats: repeats from which on what grows or fades steadily from one to the next (a sensor that warms up) is
-      no noise; of fewer a straight line takes too much.
-    moving_share: share of the low pass's window at least in which a joint moves, where what a fit leaves tells of
-      noise: at rest along a prescribed motion friction takes what is left.
-    least_overlap: share of a recording's time that two repeats at least, or the only one, must have measured.
-    minimum: channel -> deviation below which its noise is never believed, in the channel's unit: what sensors of arms
-      resolve.
-    minimum_share: likewise of a channel that one repeat measured, as a share of what moves in it where its motor is
-      small.
+    least_window: share of the low pass's window that must be measured; the measured part is renormalised, and its noise
+      with it.
+    trend_repeats: number of repeats from which on a linear trend over the repeats (a sensor that warms up) is removed
+      before the noise is estimated; with fewer, a straight line takes too many degrees of freedom.
+    moving_share: share of the low pass's window in which a joint must move for its residual to enter the estimate of
+      the noise.  At rest along a prescribed motion friction absorbs the residual.
+    least_overlap: share of a recording's time that at least two repeats, or the only one, must have measured.
+    minimum: channel -> smallest standard deviation of its noise, in the channel's unit: what arms' sensors resolve.
+    minimum_share: the same for a channel of one repeat, as a share of the channel's own standard deviation.  It applies
+      where it is smaller than `minimum`, which small motors need.
     """
 
     cutoff: float = 8.0
@@ -84,17 +84,24 @@ DEFAULT_NOISE = NoiseConfig()
 
 
 def coarse_clock(start: float, end: float, rate: float = DEFAULT_NOISE.rate) -> np.ndarray:
-    """[K] s from start to end at about `rate` Hz."""
+    """Return [K] s, evenly spaced from start to end at about `rate` Hz."""
     return np.linspace(start, end, max(2, round((end - start) * rate) + 1))
 
 
 def lowpass(clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE) -> scipy.sparse.csr_array:
-    """[K, T] matrix from samples at a growing `clock` to smoothed values at `coarse`, sparse: a window is short.
+    """Return the low pass as a sparse matrix [K, T], from samples at `clock` to smoothed values at `coarse`.
 
-    A windowed sinc (Hann, 1.5 periods of the cutoff to each side), cut and renormalised at the
-    ends so that a constant stays that constant.  Where the clock is silent for so long that less than `least_window` of
-    the window is left, the row is zero.  Source: windowed-sinc design, Oppenheim and Schafer, ch. 7.
-    Raises ValueError for a clock that is too coarse for the cutoff throughout.
+    The kernel is a windowed sinc (Hann, 1.5 periods of the cutoff to each side).  It is cut and renormalised at the
+    ends, so that a constant is preserved.  A row is zero where the samples cover less than `least_window` of the
+    window's area.  Source: windowed-sinc design, Oppenheim and Schafer, ch. 7.
+
+    Args:
+        clock: [T] s, increasing times of the samples.
+        coarse: [K] s, times of the smoothed values.
+        config: cutoff and `least_window`.
+
+    Raises:
+        ValueError: the whole clock is too coarse for the cutoff.
     """
     half = 1.5 / config.cutoff
     first, last = np.searchsorted(clock, coarse - half), np.searchsorted(clock, coarse + half, side="right")
@@ -108,11 +115,11 @@ def lowpass(clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT
     shape = (len(coarse), len(clock))
     weights = scipy.sparse.csr_array((kernel * spacing[columns], columns, begins), shape=shape)
     total = weights.sum(axis=1)
-    enough = total > config.least_window / (2.0 * config.cutoff)  # of the whole window's area
-    usual = np.median(np.diff(clock)) if len(clock) > 1 else np.inf
-    if not enough.all() and usual > COARSEST / config.cutoff:
-        raise ValueError(f"a clock with steps of {usual:.3g} s is too coarse to be smoothed at {config.cutoff} Hz")
-    return scipy.sparse.diags_array(np.where(enough, 1.0 / np.where(enough, total, 1.0), 0.0)) @ weights
+    covered = total > config.least_window / (2.0 * config.cutoff)  # share of the whole window's area
+    step = np.median(np.diff(clock)) if len(clock) > 1 else np.inf
+    if not covered.all() and step > LONGEST_STEP / config.cutoff:
+        raise ValueError(f"a clock with steps of {step:.3g} s is too coarse to be smoothed at {config.cutoff} Hz")
+    return scipy.sparse.diags_array(np.where(covered, 1.0 / np.where(covered, total, 1.0), 0.0)) @ weights
 
 
 def smooth(
@@ -121,22 +128,24 @@ def smooth(
     kernel: scipy.sparse.csr_array,
     least_window: float = DEFAULT_NOISE.least_window,
 ) -> np.ndarray:
-    """[N, T, C] with mask, through a `lowpass` [K, T] -> [N, K, C], renormalised over the samples that were measured.
+    """Return values [N, T, C] through a `lowpass` [K, T] as [N, K, C], renormalised over the measured samples.
 
-    NaN where less than a share `least_window` of the kernel's weight was measured.
+    The result is NaN where less than a share `least_window` of the kernel's weight was measured.
+
+    mask: [N, T, C] bool, samples that were measured.
     """
-    top = np.stack([kernel @ np.where(seen, repeat, 0.0) for repeat, seen in zip(values, mask, strict=True)])
-    weight = np.stack([kernel @ seen.astype(float) for seen in mask])
-    return np.where(np.abs(weight) > least_window, top / np.where(weight == 0, 1, weight), np.nan)
+    filtered = np.stack([kernel @ np.where(measured, v, 0.0) for v, measured in zip(values, mask, strict=True)])
+    weight = np.stack([kernel @ measured.astype(float) for measured in mask])
+    return np.where(np.abs(weight) > least_window, filtered / np.where(weight == 0, 1, weight), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of the mean of the repeats, per column, over the coarse clock.
+    """Noise of the mean of the repeats, for each column, over the coarse clock.
 
-    mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit
-    covariance when x is the truth.  repeats: [N, K, C], smoothed; count: [K, C] how many of them were measured, none
-    in a gap of one repeat.
+    mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit covariance if x is the
+    noise-free signal.  repeats: [N, K, C], smoothed.  count: [K, C] number of repeats that measured an instant; 0 in a
+    gap of the only repeat.
     """
 
     mean: np.ndarray
@@ -145,85 +154,93 @@ class Noise:
     count: np.ndarray
 
     def stated(self, deviation: np.ndarray) -> Noise:
-        """White noise of a stated deviation [C], in the channel's unit, in place of the estimated one.
+        """Return white noise of a stated standard deviation [C], in the channel's unit, instead of the estimated one.
 
-        What no repeat measured counts for nothing.
+        Instants that no repeat measured get weight zero.
         """
-        seen = (self.count > 0).T[:, None]  # [C, 1, K]
-        return replace(self, whitener=np.eye(len(self.mean)) * seen / deviation[:, None, None])
+        measured = (self.count > 0).T[:, None]  # [C, 1, K]
+        return replace(self, whitener=np.eye(len(self.mean)) * measured / deviation[:, None, None])
 
 
 def estimate_noise(
     repeats: np.ndarray, *, minimum: float, measured: np.ndarray | None = None, config: NoiseConfig = DEFAULT_NOISE
 ) -> Noise:
-    """Noise of smoothed repeats [N, K, C], whole in time.
+    """Estimate the noise of smoothed repeats.
 
-    measured: [N, K, C] bool, all unless given; what was not holds the mean of the others, and counts for nothing.
+    The model of a column has two parts: a constant of each repeat, and a stationary process.  Both are estimated from
+    the deviations of the repeats from their mean.  From `trend_repeats` repeats on, a linear trend over the repeats is
+    removed first.  The autocovariance of the stationary part is biased, hence positive semi-definite.  It is tapered to
+    zero at `longest_lag` by a Parzen window and shrunk by `shrinkage` towards white noise of the same variance.  The
+    variance of the constants is added.  One repeat gets white noise of deviation `minimum`.
+    Source of the window: Parzen, Mathematical considerations in the estimation of spectra, Technometrics 1961.
 
-    Per column, the repeats' deviations from their mean, from `trend_repeats` on without their trend over the order,
-    are a constant of each repeat and a stationary rest.
-    The rest's autocovariance (biased, hence positive semi-definite) is tapered to `longest_lag` by a Parzen
-    window, shrunk by `shrinkage` towards white noise of the same variance, and never less than `minimum` (a deviation
-    in the channel's unit: what one repeat alone would have); the constants' variance is added to it.  With one repeat
-    only `minimum` is used, as white noise.  Source of the window: Parzen, Mathematical considerations in the estimation
-    of spectra, Technometrics 1961.
+    Args:
+        repeats: [N, K, C] without gaps.
+        minimum: smallest standard deviation of the noise of one repeat, in the channel's unit.
+        measured: [N, K, C] bool, True throughout if None.  The other entries hold the mean of the measured repeats and
+            have no weight in the estimate.
+        config: settings of the noise model.
     """
     _, length, columns = repeats.shape
     mean = repeats.mean(axis=0)
     count = np.full(mean.shape, len(repeats)) if measured is None else measured.sum(axis=0)
     whitener = np.empty((columns, length, length))
     for c in range(columns):
-        seen = np.ones(repeats.shape[:2], bool) if measured is None else measured[:, :, c]
-        lags, constant = _lags(repeats[:, :, c] - mean[:, c], seen, config)
+        mask = np.ones(repeats.shape[:2], bool) if measured is None else measured[:, :, c]
+        lags, constant = _lags(repeats[:, :, c] - mean[:, c], mask, config)
         variance = max(lags[0], minimum**2)
         lags = (1 - config.shrinkage) * lags
         lags[0] = variance
         if not (constant or lags[1:].any()):  # white
             whitener[c] = np.diag(np.sqrt(count[:, c] / variance))
             continue
-        of_mean = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
-        whitener[c] = np.linalg.inv(np.linalg.cholesky(of_mean))
+        covariance = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
+        whitener[c] = np.linalg.inv(np.linalg.cholesky(covariance))
     return Noise(mean, whitener, repeats, count)
 
 
-def _lags(error: np.ndarray, seen: np.ndarray, config: NoiseConfig) -> tuple[np.ndarray, float]:
-    """[K] tapered autocovariance of what repeats [N, K] are apart, and the variance of their constants beside it.
+def _lags(deviation: np.ndarray, mask: np.ndarray, config: NoiseConfig) -> tuple[np.ndarray, float]:
+    """Return the tapered autocovariance [K] of repeats' deviations [N, K], and the variance of the repeats' constants.
 
-    seen: [N, K] bool; both are zero for what but one repeat measured.
+    Both are zero where only one repeat was measured.
+
+    mask: [N, K] bool, samples that were measured.
     """
-    length, count = error.shape[1], seen.sum(axis=0)
-    enough = count >= config.trend_repeats
-    error = np.where(enough, detrend(error, seen), error)
-    lengths, freedom = seen.sum(axis=1, keepdims=True), (count - 1 - enough).clip(0).sum()
-    if freedom == 0:
+    length, count = deviation.shape[1], mask.sum(axis=0)
+    has_trend = count >= config.trend_repeats
+    deviation = np.where(has_trend, detrend(deviation, mask), deviation)
+    lengths, degrees_of_freedom = mask.sum(axis=1, keepdims=True), (count - 1 - has_trend).clip(0).sum()
+    if degrees_of_freedom == 0:
         return np.zeros(length), 0.0
-    constants = error.sum(axis=1, where=seen, keepdims=True) / np.maximum(lengths, 1)
-    rest = np.where(seen, error - constants, 0.0)
-    spectrum = np.abs(np.fft.rfft(rest, 2 * length, axis=1)) ** 2
-    lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / freedom
+    constants = deviation.sum(axis=1, where=mask, keepdims=True) / np.maximum(lengths, 1)
+    stationary = np.where(mask, deviation - constants, 0.0)
+    spectrum = np.abs(np.fft.rfft(stationary, 2 * length, axis=1)) ** 2
+    lags = np.fft.irfft(spectrum.sum(axis=0), 2 * length)[:length] / degrees_of_freedom
     longest = round(config.longest_lag * config.rate)
     window = np.zeros(length)
     window[: longest + 1] = scipy.signal.windows.parzen(2 * longest + 1)[longest : longest + length]
-    return lags * window, float(np.sum(lengths * constants**2) / freedom)
+    return lags * window, float(np.sum(lengths * constants**2) / degrees_of_freedom)
 
 
-def detrend(x: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
-    """x [N, ...] without its straight line over the order of the rows; their mean stays.
+def detrend(x: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Return x [N, ...] without its linear trend over the row number; the mean is preserved.
 
-    seen: bool of the same shape, which entries count; all unless given.  Where fewer than two do, x stays.
+    mask: bool of the same shape, entries that enter the fit of the line; all if None.  A column with fewer than two
+      such entries is returned unchanged.
     """
-    seen = np.ones(x.shape, bool) if seen is None else seen
-    count = np.maximum(seen.sum(axis=0), 1)
+    mask = np.ones(x.shape, bool) if mask is None else mask
+    count = np.maximum(mask.sum(axis=0), 1)
     order = np.arange(len(x)).reshape(-1, *[1] * (x.ndim - 1))
-    order = np.where(seen, order - np.sum(order * seen, axis=0) / count, 0.0)
+    order = np.where(mask, order - np.sum(order * mask, axis=0) / count, 0.0)
     slope = np.sum(order * x, axis=0) / np.maximum(np.sum(order**2, axis=0), 1e-30)
     return x - order * slope
 
 
 def correlation_time(residuals: np.ndarray, rate: float = DEFAULT_NOISE.rate) -> np.ndarray:
-    """[C] s, how long residuals [K, C] at `rate` Hz stay correlated: their autocorrelation's sum up to its first zero.
+    """Return the integrated autocorrelation time [C] s of residuals [K, C] at `rate` Hz.
 
-    Two-sided, so that K / (rate * this) is about the number of independent samples.
+    The autocorrelation is summed on both sides up to its first zero.  So K / (rate * result) is about the number of
+    independent samples.
     """
     times = []
     for column in (residuals - residuals.mean(axis=0)).T:
@@ -234,21 +251,24 @@ def correlation_time(residuals: np.ndarray, rate: float = DEFAULT_NOISE.rate) ->
     return np.array(times)
 
 
-def deviation_of(residuals: np.ndarray, counts: np.ndarray | None = None) -> np.ndarray:
-    """[C] root mean square of residuals [K, C].
+def deviation_of(residuals: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Return the root mean square [C] of residuals [K, C].
 
-    counts: [K, C] bool, the residuals that tell of noise; all unless given, and of a column that has none.
+    mask: [K, C] bool, residuals that enter it; all if None.  A column without any uses all of its residuals.
     """
-    counts = np.ones(residuals.shape, bool) if counts is None else counts | ~counts.any(axis=0)
-    return np.sqrt(np.sum(np.where(counts, residuals, 0.0) ** 2, axis=0) / counts.sum(axis=0))
+    mask = np.ones(residuals.shape, bool) if mask is None else mask | ~mask.any(axis=0)
+    return np.sqrt(np.sum(np.where(mask, residuals, 0.0) ** 2, axis=0) / mask.sum(axis=0))
 
 
 def stated_deviation(
-    residuals: np.ndarray, counts: np.ndarray | None = None, rate: float = DEFAULT_NOISE.rate
+    residuals: np.ndarray, mask: np.ndarray | None = None, rate: float = DEFAULT_NOISE.rate
 ) -> np.ndarray:
-    """[C] deviation to state as noise so that correlated residuals [K, C] count as often as they are independent.
+    """Return the standard deviation [C] of white noise that carries as much information as residuals [K, C].
 
-    counts: see `deviation_of`.
+    It is the root mean square, times the square root of the correlation time in samples.  So correlated residuals count
+    as often as they hold independent samples.
+
+    mask: see `deviation_of`.
     """
-    rms = deviation_of(residuals, counts)
+    rms = deviation_of(residuals, mask)
     return rms * np.sqrt(np.maximum(1.0, correlation_time(residuals, rate) * rate))

@@ -1,7 +1,8 @@
-"""One measured channel made ready to be compared with a replay: its clock, its filter and its noise.
+"""One measured channel, prepared for the comparison with a replay: its clock, its filter and its noise.
 
-A replay's trace goes through exactly what the data went through: resampling, the low pass with the repeats' masks,
-and the mean over the repeats, all of it one matrix, of which each row is a short window.
+The data pass through a low pass with the repeats' masks, and a mean over the repeats.  A simulated trace is resampled
+to the channel's clock and passes through the same two operations.  The three are one matrix whose rows have few
+consecutive entries.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from droid_jax.recordings.recording import Channel
 
 
 class TooLong(ValueError):
-    """A recording whose covariance of the noise would fill the memory."""
+    """The covariance of a recording's noise does not fit into memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShortFilter:
-    """A filter whose outputs are sums over short windows of T samples.
+    """A filter whose outputs are weighted sums over short windows of T samples.
 
-    begin: [K] first sample of each window.  weights: [C or 1, K, W] of its samples, for each column or for all.
+    begin: [K] first sample of each window.  weights: [C or 1, K, W] of the samples, for each column or one for all.
     """
 
     begin: np.ndarray
@@ -35,12 +36,12 @@ class ShortFilter:
 
     @property
     def rows(self) -> np.ndarray:
-        """[K, W] the samples of each window."""
+        """[K, W] sample numbers of each window."""
         return self.begin[:, None] + np.arange(self.weights.shape[-1])
 
 
 def short_filter(filters: Sequence[sparse.csr_array], length: int) -> ShortFilter:
-    """Sparse filters [K, T], one for each column or one for all, by their windows; length: T."""
+    """Return sparse filters [K, T], one for each column or one for all, as a `ShortFilter`; length: T."""
     count = len(filters[0].indptr) - 1
     rows = [np.repeat(np.arange(count), np.diff(each.indptr)) for each in filters]
     first, last = np.full(count, length), np.zeros(count, int)
@@ -57,12 +58,15 @@ def short_filter(filters: Sequence[sparse.csr_array], length: int) -> ShortFilte
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One channel ready to be compared.
+    """One measured channel, prepared for the comparison.
 
-    unit: of the channel.  at: [Tc] fractional rows of the simulated trace; values [N,Tc,C], mask [N,Tc,C]; columns [C]
-    of the simulated channel; kernel from the trace to K instants, and noise for the whitened form; span [2] s of the
-    coarse clock; weight in the distance; moves [K,C] bool, instants that were measured and at which a column's joint
-    moves: at rest along a prescribed motion friction takes what is left, and what is left tells nothing of noise.
+    unit: of the channel.  at: [Tc] fractional rows of the simulated trace at the samples' times.
+    values: [N, Tc, C] samples.  mask: [N, Tc, C] bool, those that were measured.
+    columns: [C] of the simulated channel.  kernel: from the simulated trace to K instants.
+    noise: of the repeats' mean, for whitened residuals.  span: [2] s, first and last instant of the coarse clock.
+    weight: of the channel in the distance.
+    moves: [K, C] bool, measured instants at which the column's joint moves.  At rest along a prescribed motion friction
+      absorbs the residual, which is then no estimate of the noise.
     """
 
     name: str
@@ -79,15 +83,16 @@ class Measured:
 
     @property
     def clock(self) -> np.ndarray:
-        """[K] s, the coarse clock: the times of what is smoothed and whitened."""
+        """[K] s, the coarse clock of the smoothed values and of the whitened residuals."""
         return np.linspace(*self.span, len(self.noise.mean))
 
 
 def least_noise(name: str, mean: np.ndarray, config: NoiseConfig = DEFAULT_NOISE) -> np.ndarray:
-    """[C] deviation below which the noise of a channel that one repeat measured is never believed, in its unit.
+    """Return the smallest standard deviation [C] of the noise of a channel of one repeat, in the channel's unit.
 
-    mean: [K, C] what was measured, smoothed.  Noise is told from what a fit leaves, which a model with too many
-    parameters takes away.
+    Such noise is estimated from the residuals of a fit, which are too small if the model overfits.
+
+    mean: [K, C] smoothed measurement.
     """
     return np.minimum(config.minimum[name], config.minimum_share * np.maximum(np.std(mean, axis=0), 1e-9))
 
@@ -97,14 +102,24 @@ def prepared(
     channel: Channel,
     clock: np.ndarray,
     weight: float,
-    apart: np.ndarray | None = None,
+    motion_torques: np.ndarray | None = None,
     rest: np.ndarray | None = None,
     config: NoiseConfig = DEFAULT_NOISE,
 ) -> Measured:
-    """A channel made ready for a replay whose rows have the times `clock` [T] s; apart, rest: as in `make_comparison`.
+    """Prepare a channel for the comparison with a replay.
 
-    Raises ValueError for a channel that no replay produces, unknown columns, a constant one, one outside the motion,
-    one with a stretch that none of several repeats measured, and one too long for the memory.
+    Args:
+        scene: what is simulated.
+        channel: as it was recorded.
+        clock: [T] s, regular, times of the replay's rows.
+        weight: of the channel in the distance.
+        motion_torques: see `make_comparison`; None for channels other than torque.
+        rest: see `make_comparison`.
+        config: settings of the noise model.
+
+    Raises:
+        ValueError: no replay produces the channel, its columns are unknown or constant, it lies outside of the motion,
+            none of several repeats measured some stretch of it, or it is too long for the memory.
     """
     channel, columns = compared_columns(scene, channel, config)
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
@@ -115,16 +130,17 @@ def prepared(
         )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]), config.rate)
-    _needs_memory(channel, coarse)
+    _check_memory(channel, coarse)
     kernel = lowpass(time, coarse, config)
     resampling = _resampling(clock, time)
-    off = 0.0 if apart is None else np.stack([resampling @ a[:, columns] for a in apart])
-    repeats = smooth(values - off, mask, kernel, config.least_window)
-    seen = short_filter(_same_filters(kernel, mask, ~np.isnan(repeats), resampling), len(clock))
+    offsets = 0.0 if motion_torques is None else np.stack([resampling @ t[:, columns] for t in motion_torques])
+    repeats = smooth(values - offsets, mask, kernel, config.least_window)
+    trace_filter = short_filter(_trace_filters(kernel, mask, ~np.isnan(repeats), resampling), len(clock))
     repeats, measured = _fill(repeats, channel, coarse, config.least_overlap)
     noise = estimate_noise(repeats, minimum=config.minimum[channel.name], measured=measured, config=config)
     step = clock[1] - clock[0]
-    still = np.zeros((len(clock), len(scene.joints)), bool) if rest is None else rest[:, : len(scene.joints)]
+    at_rest = np.zeros((len(clock), len(scene.joints)), bool) if rest is None else rest[:, : len(scene.joints)]
+    moving = kernel @ (resampling @ (~at_rest[:, columns]).astype(float)) > config.moving_share
     return Measured(
         name=channel.name,
         unit=channel.unit,
@@ -132,16 +148,20 @@ def prepared(
         values=values,
         mask=mask,
         columns=columns,
-        kernel=seen,
+        kernel=trace_filter,
         noise=noise,
         span=(float(coarse[0]), float(coarse[-1])),
         weight=weight,
-        moves=(kernel @ (resampling @ (~still[:, columns]).astype(float)) > config.moving_share) & (noise.count > 0),
+        moves=moving & (noise.count > 0),
     )
 
 
 def compared_columns(scene: Scene, channel: Channel, config: NoiseConfig = DEFAULT_NOISE) -> tuple[Channel, np.ndarray]:
-    """A channel's columns that are compared, and theirs [C] in the simulated channel; ValueError as in `prepared`."""
+    """Return a channel with its compared columns, and their numbers [C] in the simulated channel.
+
+    Raises:
+        ValueError: no replay produces the channel, or its columns are unknown or constant.
+    """
     if channel.name not in config.minimum:
         raise ValueError(f"channel {channel.name!r} has no simulated counterpart; known: {', '.join(config.minimum)}")
     if channel.name == "object_angle":
@@ -161,50 +181,62 @@ def compared_columns(scene: Scene, channel: Channel, config: NoiseConfig = DEFAU
 def in_window(
     channel: Channel, repeat: int, clock: np.ndarray, coarse: np.ndarray, config: NoiseConfig = DEFAULT_NOISE
 ) -> tuple[np.ndarray, tuple[sparse.csr_array, ...]]:
-    """One repeat's values [K, C] at instants `coarse` [K] s within a replay's rows `clock` [T] s, and the same filter
-    for its trace, C or 1 of [K, T].
+    """Return one repeat's smoothed values in a window, and the filter of the simulated trace.
 
-    NaN where too little was measured.  Nothing from outside of the replay's rows enters.
+    Samples outside of the replay's rows do not enter.
+
+    Args:
+        channel: as it was recorded, with its compared columns.
+        repeat: its number.
+        clock: [T] s, times of the replay's rows.
+        coarse: [K] s, instants of the smoothed values.
+        config: settings of the noise model.
+
+    Returns:
+        Values [K, C], NaN where too little was measured; and one filter [K, T] for each of C columns, or one for all.
     """
     inside = (channel.time >= clock[0] - 1e-9) & (channel.time <= clock[-1] + 1e-9)
     time, values, mask = channel.time[inside], channel.values[[repeat]][:, inside], channel.mask[[repeat]][:, inside]
     if len(time) < 2:
         return np.full((len(coarse), len(channel.columns)), np.nan), (sparse.csr_array((len(coarse), len(clock))),)
     kernel = lowpass(time, coarse, config)
-    found = smooth(values, mask, kernel, config.least_window)
-    return found[0], tuple(_same_filters(kernel, mask, ~np.isnan(found), _resampling(clock, time)))
+    smoothed = smooth(values, mask, kernel, config.least_window)
+    return smoothed[0], tuple(_trace_filters(kernel, mask, ~np.isnan(smoothed), _resampling(clock, time)))
 
 
 def _of_joints(scene: Scene, channel: Channel) -> Channel:
-    """A channel's columns that are measured joints of the scene, in its order: others were left out on purpose."""
+    """Return a channel with the columns of the scene's measured joints, in the scene's order.
+
+    Columns of other joints of the model are dropped: the user left them out (--joints).
+    """
     joints = [mujoco.mj_id2name(scene.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(scene.model.njnt)]
     unknown = [c for c in channel.columns if c not in joints]
-    kept = [channel.columns.index(joint) for joint in scene.joints if joint in channel.columns]
-    if unknown or not kept:
+    index = [channel.columns.index(joint) for joint in scene.joints if joint in channel.columns]
+    if unknown or not index:
         raise ValueError(
             f"channel {channel.name!r}: unknown joints {', '.join(unknown or channel.columns)}; "
             f"valid: {', '.join(scene.joints)}"
         )
-    columns = tuple(channel.columns[i] for i in kept)
-    return replace(channel, columns=columns, values=channel.values[..., kept], mask=channel.mask[..., kept])
+    columns = tuple(channel.columns[i] for i in index)
+    return replace(channel, columns=columns, values=channel.values[..., index], mask=channel.mask[..., index])
 
 
-def _needs_memory(channel: Channel, coarse: np.ndarray) -> None:
-    """Raise TooLong where the noise's covariance, which grows with the square of the duration, fills the memory."""
+def _check_memory(channel: Channel, coarse: np.ndarray) -> None:
+    """Raise TooLong if the noise's covariance, quadratic in the duration, does not fit into memory."""
     needed = 8.0 * len(channel.columns) * len(coarse) ** 2
-    if not hasattr(os, "sysconf"):  # elsewhere than on Linux and macOS
+    if not hasattr(os, "sysconf"):  # only Linux and macOS have it
         return
-    there = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    if 2.0 * needed > there:  # what computes with it needs as much again
+    memory = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    if 2.0 * needed > memory:  # inverting it needs as much again
         raise TooLong(
             f"channel {channel.name!r} of {coarse[-1] - coarse[0]:.0f} s needs {needed / 1e9:.1f} GB for the "
-            f"covariance of its noise, and half of this machine's memory is {there / 2e9:.1f} GB: cut the "
+            f"covariance of its noise, and half of this machine's memory is {memory / 2e9:.1f} GB: cut the "
             "recording (`python -m droid_jax.run convert --start S --end S`), or fit its parts as several"
         )
 
 
 def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
-    """[Tc, T] linear interpolation from the replay's clock to a channel's."""
+    """[Tc, T] matrix of linear interpolation from the replay's clock to a channel's."""
     at = np.clip((time - clock[0]) / (clock[1] - clock[0]), 0, len(clock) - 1)
     low = np.minimum(at.astype(int), len(clock) - 2)
     rows, share = np.arange(len(time)), at - low
@@ -212,63 +244,71 @@ def _resampling(clock: np.ndarray, time: np.ndarray) -> sparse.csr_array:
     return sparse.csr_array(entries, shape=(len(time), len(clock)))
 
 
-def _same_filters(
-    kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray, resampling: sparse.csr_array
+def _trace_filters(
+    kernel: sparse.csr_array, mask: np.ndarray, used: np.ndarray, resampling: sparse.csr_array
 ) -> list[sparse.csr_array]:
-    """What resampling, smoothing with a mask and averaging over repeats does to a replay's trace [T]: C or 1 of [K, T].
+    """Return the filters of a simulated trace [T] that equal those of the data: C matrices [K, T], or one for all.
 
-    kernel [K, Tc]; mask [N, Tc, C]; kept [N, K, C], the outputs that enter the mean; resampling [Tc, T].
+    They resample, smooth with the repeats' masks, and average over the repeats.
+
+    Args:
+        kernel: [K, Tc] low pass.
+        mask: [N, Tc, C] bool, measured samples.
+        used: [N, K, C] bool, smoothed values that enter the mean over the repeats.
+        resampling: [Tc, T].
     """
     if mask.all():
         return [kernel @ resampling]
-    columns = list(zip(mask.transpose(2, 0, 1), kept.transpose(2, 0, 1), strict=True))
-    if all(np.array_equal(m, columns[0][0]) and np.array_equal(k, columns[0][1]) for m, k in columns):
-        columns = columns[:1]  # a log that was silent for a while was so in all of them
+    columns = list(zip(mask.transpose(2, 0, 1), used.transpose(2, 0, 1), strict=True))
+    if all(np.array_equal(m, columns[0][0]) and np.array_equal(u, columns[0][1]) for m, u in columns):
+        columns = columns[:1]  # a gap of a log is often the same in all columns
     return [_mean_filter(kernel, *column) @ resampling for column in columns]
 
 
-def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, kept: np.ndarray) -> sparse.csr_array:
-    """[K, Tc] the mean of one column's filters: kernel [K, Tc], renormalised over each repeat's mask [N, Tc].
+def _mean_filter(kernel: sparse.csr_array, mask: np.ndarray, used: np.ndarray) -> sparse.csr_array:
+    """[K, Tc] mean over the repeats of one column's filters, each renormalised over its repeat's mask.
 
-    kept: [N, K].
+    kernel: [K, Tc].  mask: [N, Tc] bool.  used: [N, K] bool.
     """
     total = sparse.csr_array(kernel.shape)
-    for seen, own in zip(mask, kept, strict=True):
-        share = np.where(own, 1.0 / np.where(own, kernel @ seen.astype(float), 1.0), 0.0)
-        total += sparse.diags_array(share) @ kernel @ sparse.diags_array(seen.astype(float))
-    return sparse.diags_array(1.0 / np.maximum(kept.sum(axis=0), 1)) @ total
+    for measured, valid in zip(mask, used, strict=True):
+        scale = np.where(valid, 1.0 / np.where(valid, kernel @ measured.astype(float), 1.0), 0.0)
+        total += sparse.diags_array(scale) @ kernel @ sparse.diags_array(measured.astype(float))
+    return sparse.diags_array(1.0 / np.maximum(used.sum(axis=0), 1)) @ total
 
 
 def _refuse_constant(channel: Channel) -> None:
+    """Raise ValueError for a column that is constant in a repeat."""
     for c, column in enumerate(channel.columns):
         repeats = [values[mask] for values, mask in zip(channel.values[:, :, c], channel.mask[:, :, c], strict=True)]
-        still = [k for k, values in enumerate(repeats) if values.size and np.ptp(values) == 0]
-        if still:
-            where, do = "", "leave the joint away (--joints, in Python load_scene(joints=...))"
-            if len(still) < len(repeats):
-                masked = len(repeats) - len(still) > 1  # one repeat alone does not tell its noise
-                where = f" in repeat {still[0]}"
-                do = f"{'mask it out there, or ' if masked else ''}leave that repeat away"
+        constant = [k for k, values in enumerate(repeats) if values.size and np.ptp(values) == 0]
+        if constant:
+            where, advice = "", "leave the joint out (--joints, in Python load_scene(joints=...))"
+            if len(constant) < len(repeats):
+                masked = len(repeats) - len(constant) > 1  # two repeats at least, for an estimate of the noise
+                where = f" in repeat {constant[0]}"
+                advice = f"{'mask it out there, or ' if masked else ''}leave that repeat out"
             raise ValueError(
-                f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[still[0]][0]:g} "
-                f"{channel.unit}): a dead sensor? {do}"
+                f"channel {channel.name!r}, column {column!r} never changes{where} ({repeats[constant[0]][0]:g} "
+                f"{channel.unit}): a dead sensor? {advice}"
             )
 
 
 def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray, overlap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Repeats [N, K, C] whose gaps take the other repeats' mean there, and what was measured.
+    """Fill gaps of repeats [N, K, C] with the mean of the other repeats; return them and the mask of what was measured.
 
-    The gaps of one repeat alone are zero, as its filter of the simulation is there, and count for nothing.
-    Raises ValueError for a gap in all of several repeats, and for a column that hardly two of several measured, since
-    nothing says then how noisy it is, or one alone hardly did.
+    Gaps of the only repeat become zero, as in the filtered simulation, and have weight zero.
+
+    Raises:
+        ValueError: no repeat measured some instant, or the repeats overlap too little to estimate the noise.
     """
     measured = ~np.isnan(repeats)
     count = measured.sum(axis=0)
-    seldom = np.flatnonzero(count.sum(axis=0) < overlap * len(clock))
-    if len(repeats) == 1 and len(seldom):
+    sparse_columns = np.flatnonzero(count.sum(axis=0) < overlap * len(clock))
+    if len(repeats) == 1 and len(sparse_columns):
         raise ValueError(
-            f"channel {channel.name!r}, column {channel.columns[seldom[0]]!r} was measured for less than "
-            f"{100 * overlap:g} % of the time: leave the column away"
+            f"channel {channel.name!r}, column {channel.columns[sparse_columns[0]]!r} was measured for less than "
+            f"{100 * overlap:g} % of the time: leave the column out"
         )
     if len(repeats) == 1:
         return np.where(measured, repeats, 0.0), measured
@@ -277,12 +317,12 @@ def _fill(repeats: np.ndarray, channel: Channel, clock: np.ndarray, overlap: flo
         instant, column = gaps[0]
         raise ValueError(
             f"channel {channel.name!r}, column {channel.columns[column]!r} has a stretch that no repeat measured, at "
-            f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column away"
+            f"{clock[instant]:.3g} s: cut the recording there (window), or leave the column out"
         )
-    alone = np.flatnonzero((count - 1).sum(axis=0) < overlap * len(clock))
-    if len(alone):
+    single = np.flatnonzero((count - 1).sum(axis=0) < overlap * len(clock))
+    if len(single):
         raise ValueError(
-            f"channel {channel.name!r}, column {channel.columns[alone[0]]!r} was measured by one repeat only for most "
-            "of the time, so its noise is not known: leave the column away, or the other repeats"
+            f"channel {channel.name!r}, column {channel.columns[single[0]]!r} was measured by one repeat only for most "
+            "of the time, so its noise is not known: leave the column out, or the other repeats"
         )
     return (repeats if measured.all() else np.where(measured, repeats, np.nanmean(repeats, axis=0)[None])), measured

@@ -1,4 +1,4 @@
-"""A function of parameter vectors that remembers its results on disk."""
+"""A disk cache of a function of parameter vectors."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ Batched = Callable[[Any], np.ndarray]
 
 
 def cached(compute: Batched, folder: Path, what: str) -> Batched:
-    """`compute`, which looks in a folder before it replays.
+    """Return `compute` with a cache on disk.
+
+    A damaged file is computed again, with a warning.
 
     Args:
-        compute: [P, D] -> [P, ...], the same for the same rows.
-        folder: belongs to this function's recording alone.
+        compute: [P, D] -> [P, ...], deterministic.
+        folder: of the cache; it belongs to this function's recording alone.
         what: begins the names of the files.
     """
 
-    def remembered(values: Any) -> np.ndarray:
-        rows = np.asarray(values, np.float32)  # what a replay is given; the last digits of a double may vary
+    def lookup(values: Any) -> np.ndarray:
+        rows = np.asarray(values, np.float32)  # the precision of a replay; the last digits of a double may vary
         path = folder / f"{what}_{hashlib.sha256(rows.tobytes()).hexdigest()[:32]}.npz"
         try:
-            found = read_npz(path, ("rows", "digest"))
-            kept, digest = found["rows"], str(found["digest"])
-            if digest != _digest(folder.name, what, rows, kept):
+            content = read_npz(path, ("rows", "digest"))
+            out, digest = content["rows"], str(content["digest"])
+            if digest != _digest(folder.name, what, rows, out):
                 raise ValueError("its content is not what was written")
-            return kept
+            return out
         except FileNotFoundError:
             pass
         except (ValueError, OSError) as error:
@@ -42,11 +44,11 @@ def cached(compute: Batched, folder: Path, what: str) -> Batched:
         write_npz(path, {"rows": out, "digest": np.array(_digest(folder.name, what, rows, out))})
         return out
 
-    return remembered
+    return lookup
 
 
 def _digest(role: str, what: str, rows: np.ndarray, out: np.ndarray) -> str:
-    """sha256 over what was asked for, of which recording, and what came of it."""
+    """sha256 of the recording's folder name, the kind of result, the rows and the result."""
     sha = hashlib.sha256(f"{role} {what} {rows.shape}".encode())
     sha.update(np.ascontiguousarray(rows).tobytes())
     sha.update(f"{out.dtype.str} {out.shape}".encode())

@@ -1,8 +1,8 @@
-"""Simulation against measurement: what of a recording is compared, and the residuals.
+"""Simulation against measurement: the compared channels of a recording, its distance and its residuals.
 
-A `Comparison` holds a recording's measured channels on the host and two traceable functions of a
-`Rollout` of one sample: the distance in units (equation 1 of the paper) and the whitened
-residuals, in units of the noise of the repeats' mean.
+A `Comparison` holds a recording's measured channels on the host, and two traceable functions of a `Rollout` of one
+sample.  One is the distance in physical units (equation 1 of the paper).  The other is the whitened residuals, in units
+of the noise of the repeats' mean.
 """
 
 from __future__ import annotations
@@ -27,36 +27,38 @@ from droid_jax.simulate.initial_state import StartConfig
 from droid_jax.simulate.measured_motion import CUTOFF
 from droid_jax.simulate.rest import RestConfig
 
-LEADS = "torque"  # the channel that others, which follow from it through the servo, stand behind
+LEADING = "torque"  # channel of figures and checks, where it is compared; the servo relates it to the other channels
 
 
 @dataclass(frozen=True)
 class CompareConfig:
     """How simulation and measurement are compared.
 
-    channels: weight of each compared channel in the distance, per unit of the channel, above 0;
-      `channels.in_noise_units` weighs several by their noise.  Weights act in the distance and the search alone:
-      residuals in noise units, which are refined, count every channel by its noise.
+    channels: weight of each compared channel in the distance, per unit of the channel, above 0.
+      `channels.in_noise_units` sets weights by the channels' noise.  The weights act in the distance and the search
+      only.  The refinement uses residuals in noise units, which need no weights.
     failure_cost: c of equation 1, N m, added where the grasp is lost or the door stays shut.
-    non_finite_cost: N m, the cost of a replay that blew up.  Weights above one and noise units multiply it, so that it
-      stays above what replays cost (`Comparison.penalty`).
-    shut_angle: rad; a door that moves less than this (or half of what the measured one does) stayed shut, unless the
-      measured one does so too, or the recording's phases end with the grasp; of a slide only the measured one tells.
+    non_finite_cost: N m, the cost of a replay that blew up; see `Comparison.penalty` for other units.
+    shut_angle: rad.  A door counts as shut if it moves by less than this, or by less than `shut_share` of the measured
+      travel.  It is not checked if the measured door stays shut too, or if the recording's phases end with the grasp.
+      For a slide only the measured travel is used.
+    shut_share: share of the measured travel, see `shut_angle`; a design choice.
     grip_share: share of the gripping time that all fingers must touch.
-    whitened: the cost is the root mean square of the whitened residuals instead of N m.
+    whitened: the cost is the root mean square of the whitened residuals, without a unit, instead of equation 1.
     motion_cutoff: Hz, filter of the measured positions of a recording without commands.
-    rest: below which speed a joint of such a recording counts as at rest, where its friction is only bounded.
-    start: what decides where a motion starts, and whether repeats start at one place.
-    noise: what decides the noise of the channels.
-    mj_step: replay as a MuJoCo program logs itself: mj_step's own steps of first order, each row the state before a
-      step and the command of that step.  For recordings that MuJoCo made with the scene's own time step; of a real
-      robot, or of a finer simulation, the default is the better one by far.
+    rest: when a joint of such a recording counts as at rest, where its friction is only bounded.
+    start: where a motion starts, and whether repeats start from one state.
+    noise: settings of the noise model.
+    mj_step: replay with mj_step's own first-order steps, where each row is the state before a step and the command of
+      that step.  Use it for recordings that a MuJoCo program made with the scene's own time step.  For a real robot, or
+      a finer simulation, the default is more accurate.
     """
 
     channels: Mapping[str, float] = field(default_factory=lambda: {"torque": 1.0})
     failure_cost: float = 10.0
     non_finite_cost: float = 1000.0
     shut_angle: float = 0.0873
+    shut_share: float = 0.5
     grip_share: float = 0.95
     whitened: bool = False
     motion_cutoff: float = CUTOFF
@@ -72,6 +74,7 @@ class CompareConfig:
             failure_cost=partial(number, least=0),
             non_finite_cost=partial(number, above=0),
             shut_angle=partial(number, least=0),
+            shut_share=partial(number, least=0, most=1),
             grip_share=partial(number, least=0, most=1),
             whitened=flag,
             motion_cutoff=partial(number, above=0),
@@ -82,14 +85,20 @@ class CompareConfig:
         )
         if unweighed := [name for name, weight in self.channels.items() if not weight]:
             raise ValueError(
-                f"channels: {', '.join(unweighed)} with a weight of 0 would count in noise units nonetheless: leave "
-                "the channel out"
+                f"channels: {', '.join(unweighed)} has weight 0, but the refinement does not use weights and would "
+                "compare it: leave the channel out"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Everything measured in one recording that a replay is compared with; clock: [T] s of the replay's rows."""
+    """The measured channels of one recording, prepared for the comparison with its replay.
+
+    name: of the recording.  clock: [T] s, times of the replay's rows.  channels: those that are compared.
+    grip_rows: first row, and end, in which the fingers must touch the object; None without a grip.
+    shut_travel: rad or m; an object that moves less counts as shut.  None if it is not checked.
+    phases: of the recording.  config: how simulation and measurement are compared.
+    """
 
     name: str
     clock: np.ndarray
@@ -100,10 +109,9 @@ class Comparison:
     config: CompareConfig
 
     def distance(self, rollout: Rollout) -> jax.Array:
-        """[] N m, or the compared channel's unit: equation 1, mean over repeats of ||tau_s - tau_r|| + c beta; finite
-        always.
+        """Return equation 1, the mean over repeats of ||tau_s - tau_r|| + c beta, in N m or the channel's unit.
 
-        The norm is the time mean of the Euclidean norm over the joints.
+        The norm is the time mean of the Euclidean norm over the joints.  The result [] is always finite.
         """
         if self.config.whitened:
             z = self.whitened(rollout)
@@ -115,27 +123,29 @@ class Comparison:
 
     @property
     def penalty(self) -> float:
-        """What a replay that blew up costs, in the distance's unit: `non_finite_cost` in the unit of the channel that
-        weighs most, in which one over the noise is a weight too.
+        """Cost of a replay that blew up, in the distance's unit.
+
+        It is `non_finite_cost` times the largest weight of a channel, if that is above 1, so that no finite replay
+        costs more.  For whitened residuals the weight is the inverse standard deviation of the noise.
         """
         if self.config.whitened:
-            most = max(float(np.abs(c.noise.whitener).max(initial=0.0)) for c in self.channels)
+            largest = max(float(np.abs(c.noise.whitener).max(initial=0.0)) for c in self.channels)
         else:
-            most = max(c.weight for c in self.channels)
-        return self.config.non_finite_cost * max(1.0, most)
+            largest = max(c.weight for c in self.channels)
+        return self.config.non_finite_cost * max(1.0, largest)
 
     def failed(self, rollout: Rollout) -> jax.Array:
-        """[] bool, beta of equation 1: the grasp was lost or the door stayed shut."""
+        """Return beta of equation 1, [] bool: the grasp was lost or the door stayed shut."""
         failed = jnp.array(False)
         if self.grip_rows is not None and rollout.contact.shape[-1]:
-            held = jnp.all(rollout.contact[self.grip_rows[0] : self.grip_rows[1]], axis=-1)
-            failed = failed | (jnp.mean(held) < self.config.grip_share) | ~held[-1]
+            grasped = jnp.all(rollout.contact[self.grip_rows[0] : self.grip_rows[1]], axis=-1)
+            failed = failed | (jnp.mean(grasped) < self.config.grip_share) | ~grasped[-1]
         if self.shut_travel is not None:
             failed = failed | (jnp.ptp(rollout.object_angle) < self.shut_travel)
         return failed
 
     def whitened(self, rollout: Rollout) -> jax.Array:
-        """[M] residuals of the repeats' mean in noise units; NaN throughout where the replay blew up."""
+        """Return residuals [M] of the repeats' mean in noise units; NaN throughout if the replay blew up."""
         parts = [
             _whiten(c.noise, _smooth(c, _trace(rollout, c)) - jnp.asarray(c.noise.mean, jnp.float32)).ravel()
             for c in self.channels
@@ -145,49 +155,53 @@ class Comparison:
 
     @property
     def repeats(self) -> int:
-        """N."""
+        """Number N of repeats."""
         return len(self.channels[0].values)
 
     def deviations(self) -> np.ndarray:
-        """[N, M] deviations of the repeats from their mean, whitened as the residuals are."""
+        """Return deviations [N, M] of the repeats from their mean, whitened as the residuals are."""
         parts = []
         for c in self.channels:
-            apart = c.noise.repeats - c.noise.mean  # [N, K, C]
-            parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, apart).reshape(len(apart), -1))
+            deviations = c.noise.repeats - c.noise.mean  # [N, K, C]
+            parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, deviations).reshape(len(deviations), -1))
         return np.concatenate(parts, axis=1)
 
     def unexplained(self, rollout: Rollout) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """By channel, root mean square [C] of what a model's own rollout of one sample leaves, and the deviation [C] to
-        state as its noise (`stated_deviation`).
+        """Return, by channel, the root mean square [C] of the residual of a rollout of one sample, and a noise [C].
 
-        One repeat does not tell its noise, and what a model cannot explain is far larger anyway.
+        The noise is the standard deviation of white noise with as much information (`stated_deviation`).  It serves as
+        the noise of a single repeat, which cannot be estimated, and is usually far below the model's error.
         """
 
-        def of(channel: Measured) -> tuple[np.ndarray, np.ndarray]:
-            left = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
-            least = least_noise(channel.name, channel.noise.mean, self.config.noise)
-            both = deviation_of(left, channel.moves), stated_deviation(left, channel.moves, self.config.noise.rate)
-            return np.maximum(both[0], least), np.maximum(both[1], least)
+        def estimate(channel: Measured) -> tuple[np.ndarray, np.ndarray]:
+            residual = channel.noise.mean - np.asarray(_smooth(channel, _trace(rollout, channel)))
+            minimum = least_noise(channel.name, channel.noise.mean, self.config.noise)
+            rms = deviation_of(residual, channel.moves)
+            stated = stated_deviation(residual, channel.moves, self.config.noise.rate)
+            return np.maximum(rms, minimum), np.maximum(stated, minimum)
 
-        return {channel.name: of(channel) for channel in self.channels}
+        return {channel.name: estimate(channel) for channel in self.channels}
 
     def stated(self, deviations: Mapping[str, np.ndarray]) -> Comparison:
-        """The comparison with a noise of every channel that has the deviation [C]."""
-        made = (replace(c, noise=c.noise.stated(deviations[c.name])) for c in self.channels)
-        return replace(self, channels=tuple(made))
+        """Return the comparison with white noise of stated standard deviations, by channel [C]."""
+        channels = (replace(c, noise=c.noise.stated(deviations[c.name])) for c in self.channels)
+        return replace(self, channels=tuple(channels))
 
     @property
     def leading(self) -> Measured:
-        """The channel that figures and checks are of: the torque where it is compared, else the first one."""
-        return next((c for c in self.channels if c.name == LEADS), self.channels[0])
+        """The channel of figures and checks: torque where it is compared, else the first one."""
+        return next((c for c in self.channels if c.name == LEADING), self.channels[0])
 
     def smoothed(self, rollout: Rollout, name: str | None = None) -> jax.Array:
-        """[K, C] a compared channel of the rollout (default: the leading one) through the filter of its data."""
+        """Return a compared channel [K, C] of a rollout, through the filter of its data.
+
+        name: of the channel; None for the leading one.
+        """
         c = self.leading if name is None else self.channel(name)
         return _smooth(c, _trace(rollout, c))
 
     def channel(self, name: str) -> Measured:
-        """A compared channel by name; an unknown one lists those compared."""
+        """Return a compared channel by name; ValueError for another one lists those that are compared."""
         for channel in self.channels:
             if channel.name == name:
                 return channel
@@ -202,21 +216,21 @@ def _trace(rollout: Rollout, channel: Measured) -> jax.Array:
 
 
 def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
-    """[K, C] a simulated trace [T, C] through exactly what the channel's data went through."""
+    """[K, C] a simulated trace [T, C] through the filter of the channel's data."""
     weights = jnp.asarray(channel.kernel.weights, jnp.float32)
     return jnp.einsum("ckw,kwc->kc" if len(weights) > 1 else "zkw,kwc->kc", weights, trace[channel.kernel.rows])
 
 
 def _whiten(noise: Noise, x: jax.Array) -> jax.Array:
     """[C, K] deviations [K, C] in units of the noise."""
-    own = np.einsum("ckk->ck", noise.whitener)
-    if np.count_nonzero(noise.whitener) == np.count_nonzero(own):  # white noise: a long log has many instants
-        return jnp.asarray(own, jnp.float32) * x.T
+    diagonal = np.einsum("ckk->ck", noise.whitener)
+    if np.count_nonzero(noise.whitener) == np.count_nonzero(diagonal):  # white noise: cheap also for a long log
+        return jnp.asarray(diagonal, jnp.float32) * x.T
     return jnp.einsum("ckl,lc->ck", jnp.asarray(noise.whitener, jnp.float32), x)
 
 
 def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
-    """[] mean over repeats and time of the Euclidean norm over columns; what was not measured is left out."""
+    """[] mean over repeats and time of the Euclidean norm over columns; samples that were not measured do not enter."""
     last = trace.shape[0] - 1
     low = np.clip(np.floor(channel.at).astype(int), 0, last)
     part = jnp.asarray((channel.at - low)[:, None], jnp.float32)
@@ -225,30 +239,31 @@ def _distance(channel: Measured, trace: jax.Array) -> jax.Array:
     error = jnp.where(mask, simulated[None] - jnp.asarray(np.where(channel.mask, channel.values, 0), jnp.float32), 0)
     norm = jnp.sqrt(jnp.sum(error**2, axis=-1) + 1e-20)  # [N, Tc]
     measured = jnp.any(mask, axis=-1)
-    samples = jnp.sum(measured, axis=1)  # [N], none where a repeat was not measured during the replay
+    samples = jnp.sum(measured, axis=1)  # [N], 0 where a repeat was not measured during the replay
     return jnp.sum(jnp.sum(norm * measured, axis=1) / jnp.maximum(samples, 1)) / jnp.maximum(jnp.sum(samples > 0), 1)
 
 
-def restated(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> list[Comparison]:
-    """Comparisons with the noise of single repeats restated from what one sample's rollouts leave unexplained.
+def with_estimated_noise(comparisons: Sequence[Comparison], rollouts: Sequence[Rollout]) -> list[Comparison]:
+    """Return comparisons whose noise of single repeats is estimated from the residuals of one sample's rollouts.
 
-    Recordings of the same columns share half of its size: it is the geometric mean of what this one leaves and of what
-    all leave, as root mean squares.  Each with its own, one that the model follows badly would count for little, and
-    one that it follows well for ever more: eight logs of an XL330 ended at 0.054 or 0.095 rad as their search fell out,
-    and so at 0.051 to 0.054.  With all of it shared, the log that is followed worst would decide.  One whose simulation
-    blew up keeps the noise that it had.
+    The size of the noise is the geometric mean of two root mean squares: of the recording's own residual, and of the
+    residuals of all recordings with the same columns.  The own one alone would feed back on the fit: a log that fits
+    badly would lose weight, and one that fits well would gain weight.  Fits of eight logs of an XL330 then ended at
+    0.054 or 0.095 rad, depending on the search's draws, and with the geometric mean at 0.051 to 0.054.  The shared one
+    alone would let the log that fits worst dominate.  A recording whose simulation blew up keeps its noise.
     """
     single = [k for k, c in enumerate(comparisons) if c.repeats == 1 and np.all(rollouts[k].finite)]
-    left = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
-    alike = defaultdict[tuple[Any, ...], list[np.ndarray]](list)
+    estimates = {k: comparisons[k].unexplained(rollouts[k]) for k in single}
+    same_columns = defaultdict[tuple[Any, ...], list[np.ndarray]](list)
     for k in single:
         for c in comparisons[k].channels:
-            alike[c.name, *c.columns.tolist()].append(left[k][c.name][0])
-    shared = {of: np.sqrt(np.mean(np.square(each), axis=0)) for of, each in alike.items()}
+            same_columns[c.name, *c.columns.tolist()].append(estimates[k][c.name][0])
+    shared = {columns: np.sqrt(np.mean(np.square(each), axis=0)) for columns, each in same_columns.items()}
     out = list(comparisons)
     for k in single:
         common = {c.name: shared[c.name, *c.columns.tolist()] for c in out[k].channels}
-        out[k] = out[k].stated({name: alone * np.sqrt(common[name] / rms) for name, (rms, alone) in left[k].items()})
+        noise = {name: stated * np.sqrt(common[name] / rms) for name, (rms, stated) in estimates[k].items()}
+        out[k] = out[k].stated(noise)
     return out
 
 
@@ -257,16 +272,22 @@ def make_comparison(
     recording: Recording,
     clock: np.ndarray,
     config: CompareConfig,
-    apart: np.ndarray | None = None,
+    motion_torques: np.ndarray | None = None,
     rest: np.ndarray | None = None,
 ) -> Comparison:
-    """Prepare a recording's channels for comparison with a replay whose rows have the times `clock` [T] s, regular.
+    """Prepare a recording's channels for the comparison with its replay.
 
-    apart: [N, T, J] N m by which the repeats' torques may differ because they moved, or measured their motion,
-    differently, with mean zero; it is taken off them where their noise is estimated.
-    rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`simulate.rest`).
-    Raises ValueError for a channel the recording does not have, one that no replay produces, or a
-    constant (dead) channel.
+    Args:
+        scene: what is simulated.
+        recording: the measurement, N repeats.
+        clock: [T] s, regular, times of the replay's rows.
+        config: how simulation and measurement are compared.
+        motion_torques: [N, T, J] N m, torques of the repeats' own measured motions minus their mean.  They are
+            subtracted before the noise of the torques is estimated.  None: zero.
+        rest: [T, J] bool, rows at which a joint is at rest along a prescribed motion (`simulate.rest`).
+
+    Raises:
+        ValueError: the recording does not have a compared channel, no replay produces it, or it is constant.
     """
     channels = tuple(
         prepared(
@@ -274,16 +295,16 @@ def make_comparison(
             recording.channel(name),
             clock,
             weight,
-            *((apart, rest) if name == "torque" else (None, None)),
+            *((motion_torques, rest) if name == "torque" else (None, None)),
             config=config.noise,
         )
         for name, weight in config.channels.items()
     )
-    acts = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
-    grip = recording.grip_window if acts else None
-    shut = _shut_travel(scene, recording, clock, config) if acts else None
+    has_grip = scene.grip is not None and recording.command.size > 0  # along a prescribed motion nothing is gripped
+    grip = recording.grip_window if has_grip else None
+    shut = _shut_travel(scene, recording, clock, config) if has_grip else None
     rows = None
-    if grip is not None and grip[0] < clock[-1]:  # else the grasp has only just ended
+    if grip is not None and grip[0] < clock[-1]:  # gripping begins before the replay ends
         steps, timestep = len(clock), clock[1] - clock[0]
         first, end = (int(np.clip(round((t - clock[0]) / timestep), 0, steps)) for t in grip)
         rows = (min(first, steps - 1), max(end, first + 1))
@@ -291,19 +312,19 @@ def make_comparison(
 
 
 def _shut_travel(scene: Scene, recording: Recording, clock: np.ndarray, config: CompareConfig) -> float | None:
-    """rad (m of a slide): an object that moves less than this stayed shut; None where nothing tells what is little.
+    """Travel in rad (m of a slide) below which the object counts as shut; None if it cannot be checked.
 
-    So of a part of a motion in which the measured one does not open either, or that ends with the grasp.
+    It cannot be checked if the measured object does not open, or if the recording's phases end with the grasp.
     """
     if scene.object_joint is None:
         return None
-    least = 0.0 if scene.slides(scene.object_joint) else config.shut_angle
+    minimum = 0.0 if scene.slides(scene.object_joint) else config.shut_angle
     if "object_angle" in recording.channels:
         angle = recording.channels["object_angle"]
         inside = (angle.time >= clock[0] - 1e-9) & (angle.time <= clock[-1] + 1e-9)
-        seen = angle.values[:, inside][angle.mask[:, inside]]
-        travel = float(np.ptp(seen)) if seen.size else 0.0
-        return None if travel < least else max(least, 0.5 * travel)
-    grasped = [p.end for p in recording.phases if p.name == "grasp"]
-    follows = any(p.start >= end - 1e-9 for p in recording.phases for end in grasped)
-    return (least or None) if follows or not recording.phases else None
+        measured = angle.values[:, inside][angle.mask[:, inside]]
+        travel = float(np.ptp(measured)) if measured.size else 0.0
+        return None if travel < minimum else max(minimum, config.shut_share * travel)
+    grasp_ends = [p.end for p in recording.phases if p.name == "grasp"]
+    continues = any(p.start >= end - 1e-9 for p in recording.phases for end in grasp_ends)
+    return (minimum or None) if continues or not recording.phases else None

@@ -1,20 +1,27 @@
-"""Motions that tell the parameters which a recording leaves open: a few for each joint, and the best of them.
+"""Additional motions that make parameters identifiable which a recording does not constrain.
 
-Each begins and ends where the recording does and moves one joint alone: a slow ramp, steps, a chirp, a hold elsewhere.
-Their information comes from replays at the values of `excitation`, with the noise that the recording has.  They are
-picked greedily by what they gain for each second.
+The candidates of each joint are a slow ramp, steps, a chirp and a hold at another pose.  Each moves one joint, and
+begins and ends at the recording's start.  Their information comes from replays at the values of `excitation`, with the
+recording's noise.  They are chosen greedily by their gain per second.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from droid_jax.cost.cost import make_cost
-from droid_jax.identify.excitation import Excitation, identifiability_of, jacobian_of, silent, slopes
+from droid_jax.identify.excitation import (
+    Excitation,
+    ProposalConfig,
+    identifiability_of,
+    jacobian_of,
+    silent,
+    slopes,
+)
 from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
@@ -24,25 +31,15 @@ from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
 from droid_jax.simulate.servo_gains import own_stiffness, with_stated_gains
 
-SECONDS = 6.0  # of each addition
-EASE = 0.5  # s in which a chirp begins and ends
-CHIRP = (0.3, 2.0)  # Hz
-# Largest ways, rad, that a joint is sent; a slide goes as many times its own motion in the recording.
-RAMP, STEP, SWING, AWAY = 0.6, 0.3, 0.1, 0.8
-LIMIT = 0.5  # share of a servo's torque limit that a step may ask for at once
-FREE = 0.9  # share of the way to the end of a joint's range that an addition may take
-RATE = 100.0  # Hz of an addition, where a recording has no command
-MARGIN = 0.8  # of the limit of identifiability, that an addition must reach
-LEAST = 0.05  # gain (natural logarithm of a width) below which no addition is worth its time
-MOST = 8  # additions
-COLUMNS = ("torque", "position", "velocity")
+CHANNELS = ("torque", "position", "velocity")  # that the recording of an addition has
+DEFAULT_PROPOSAL = ProposalConfig()
 
 
 @dataclass(frozen=True, eq=False)
 class Addition:
     """A motion of one joint.
 
-    what: in words.  joint: that moves.  time: [K] s from 0.  path: [K] rad or m, from and to where the joint starts.
+    what: in words.  joint: that moves.  time: [K] s from 0.  path: [K] rad or m; it begins and ends at the start.
     """
 
     what: str
@@ -53,12 +50,12 @@ class Addition:
 
 @dataclass(frozen=True, eq=False)
 class MotionProposal:
-    """What to record besides.
+    """Motions to record in addition.
 
-    chosen: in the order in which they were picked.  identifiability: of each parameter with them.
-    opened: the names that they make identifiable.  left: those that stay open.  tried: candidates.
-    joints, start: [U] of the commands, and where they begin, rad or m.
-    why: no motion was tried; empty where some were.
+    chosen: the motions, in the order of choice.  identifiability: of each parameter with them.
+    opened: names that they make identifiable.  left: names that are still not identifiable.
+    joints: [U] names of the commands.  start: [U] rad or m, where they begin.
+    tried: number of candidates.  why: why there were none; empty if there were some.
     """
 
     chosen: tuple[Addition, ...]
@@ -72,140 +69,148 @@ class MotionProposal:
 
     @property
     def seconds(self) -> float:
-        """Of all that was chosen."""
+        """Duration of all chosen motions."""
         return float(sum(a.time[-1] for a in self.chosen))
 
     @property
     def sentence(self) -> str:
-        """What to record, or why nothing would help."""
+        """What to record, or why no motion is proposed."""
         if not self.opened and not self.left:
-            return "These recordings tell all parameters."
+            return "These recordings constrain all parameters."
         if not self.tried:
-            return f"Open stay {', '.join(self.left)}. No motion is proposed: {self.why}."
-        left = f"None of the motions that were tried tells {', '.join(self.left)}" if self.left else ""
-        left += ": another load, more repeats or a narrower prior may." if left else ""
+            return f"Not identifiable: {', '.join(self.left)}. No motion is proposed: {self.why}."
+        remaining = f"No motion that was tried makes {', '.join(self.left)} identifiable" if self.left else ""
+        remaining += ": another load, more repeats or a narrower prior may." if remaining else ""
         if not self.opened:
-            return left
+            return remaining
         counts = Counter(a.what for a in self.chosen)
         motions = ", ".join(what if times == 1 else f"{times} times {what}" for what, times in counts.items())
-        return f"To tell {', '.join(self.opened)}, record besides {motions}: {self.seconds:.0f} s. {left}".strip()
+        names = ", ".join(self.opened)
+        return f"To make {names} identifiable, also record {motions}: {self.seconds:.0f} s. {remaining}".strip()
 
     def commands(self) -> tuple[np.ndarray, np.ndarray]:
-        """[K] s and [K, U] rad or m: the additions one after the other."""
+        """Return the motions one after the other: times [K] s and commands [K, U] rad or m."""
         times, rows, begin = list[np.ndarray](), list[np.ndarray](), 0.0
         for addition in self.chosen:
             time, table = addition.time + begin, np.tile(self.start, (len(addition.time), 1))
             table[:, self.joints.index(addition.joint)] = addition.path
-            first = 1 if times else 0  # it begins where the last one ended
+            first = 1 if times else 0  # the first row repeats the last one of the motion before
             times.append(time[first:])
             rows.append(table[first:])
             begin = float(time[-1])
         return np.concatenate(times), np.concatenate(rows)
 
 
-def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
-    """The motions that a recording's joints could make besides, inside their ranges; none of a hand on an object."""
+def additions(scene: Scene, recording: Recording, config: ProposalConfig = DEFAULT_PROPOSAL) -> tuple[Addition, ...]:
+    """Return the candidate motions of a recording's joints, inside their ranges.
+
+    There are none for a hand that holds an object.
+
+    scene: of the recording.  recording: whose start and rate the motions have.  config: of the motions.
+    """
     if scene.object_joint is not None or scene.grip is not None:
         return ()
     joints, start = _start(scene, recording)
-    step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / RATE
-    time = np.arange(round(SECONDS / step) + 1) * step
-    jumps = _steps(time)
-    found = list[Addition]()
+    step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / config.rate
+    time = np.arange(round(config.seconds / step) + 1) * step
+    steps = _steps(time)
+    out = list[Addition]()
     for joint, q in zip(joints, start, strict=True):
         gear = _gear(scene, recording, joint)
-        down, up, unit = _room(scene, recording, joint, float(q) / gear)
+        down, up, scale = _free_range(scene, recording, joint, float(q) / gear, config)
         if max(down, up) <= 0 or (recording.command.size and joint not in _servos(scene)):
             continue
 
-        def both(share: np.ndarray, most: float, down: float = down, up: float = up) -> np.ndarray:
-            """A path of -1 to 1 as far as there is room on each side."""
-            return np.where(share > 0, share * min(up, most), share * min(down, most))
+        def scaled(shape: np.ndarray, largest: float, down: float = down, up: float = up) -> np.ndarray:
+            """A path from a shape of -1 to 1, limited to the free range on each side."""
+            return np.where(shape > 0, shape * min(up, largest), shape * min(down, largest))
 
-        kind = "m" if scene.slides(joint) else "rad"
+        unit = "m" if scene.slides(joint) else "rad"
         side = 1.0 if up >= down else -1.0
-        for what, share, most in (
-            ("a slow ramp", _ramp(time), unit * RAMP),
-            ("steps", jumps, min(unit * STEP, _largest_jump(scene, recording, joint))),
-            (f"a chirp of {CHIRP[0]:g} to {CHIRP[1]:g} Hz", _chirp(time), unit * SWING),
-            ("a hold at another pose", side * _hold(time), unit * AWAY),
+        largest_step = min(scale * config.step, _largest_step(scene, recording, joint, config.torque_share))
+        for what, shape, largest in (
+            ("a slow ramp", _ramp(time), scale * config.ramp),
+            ("steps", steps, largest_step),
+            (f"a chirp of {config.chirp[0]:g} to {config.chirp[1]:g} Hz", _chirp(time, config), scale * config.swing),
+            ("a hold at another pose", side * _hold(time), scale * config.hold),
         ):
-            if share is jumps and not recording.command.size:
-                continue  # a measured path has no jumps
-            path = both(share, most)
-            size = f"{np.abs(path).max():.2g} {kind}"
-            found.append(Addition(f"{what} of {joint} ({size})", joint, time, q + gear * path))
-    return tuple(found)
+            if shape is steps and not recording.command.size:
+                continue  # a measured path has no steps
+            path = scaled(shape, largest)
+            size = f"{np.abs(path).max():.2g} {unit}"
+            out.append(Addition(f"{what} of {joint} ({size})", joint, time, q + gear * path))
+    return tuple(out)
 
 
 def _why_none(scene: Scene, recording: Recording) -> str:
-    """Why `additions` has no motion."""
+    """Why `additions` returns no motion."""
     joints, _ = _start(scene, recording)
     if scene.object_joint is not None or scene.grip is not None:
-        return "a hand holds an object, and its way is not known to be free"
+        return "a hand holds an object, and its path is not known to be free"
     if recording.command.size and not _servos(scene).intersection(joints):
         return "the commands go to no position servo"
     if not joints:
         return "no joint's position was measured where the recording begins"
-    return "no joint has room in its range"
+    return "every joint is at the end of its range"
 
 
 def propose(
     scene: Scene, space: Space, found: Excitation, recording: Recording, candidates: Sequence[Addition] | None = None
 ) -> MotionProposal:
-    """The shortest addition, of those of `additions`, that tells what a recording leaves open.
+    """Choose motions that make parameters identifiable which recordings do not constrain.
 
     Args:
-        scene: as of `excitation`.
-        space: likewise.
-        found: what the recording, or several, tell.
-        recording: whose start, rate and torque the additions have.
-        candidates: additions to choose from; None: `additions` of the recording.
+        scene: as for `excitation`.
+        space: as for `excitation`.
+        found: information in the recordings.
+        recording: one of them, whose start, rate and torque convention the motions have.
+        candidates: motions to choose from; None for `additions` of the recording.
 
     Returns:
-        What to record; nothing chosen where nothing is open, or where no addition would help.
+        The proposal.  No motion is chosen if all parameters are identifiable, or if no motion helps.
     """
+    config = found.config.proposal
     joints, start = _start(scene, recording)
-    candidates = additions(scene, recording) if candidates is None else tuple(candidates)
-    limit = found.config.identifiability.identifiable
+    candidates = additions(scene, recording, config) if candidates is None else tuple(candidates)
+    target = config.margin * found.config.identifiability.identifiable
     main = ~space.nuisance
     chosen, total = list[Addition](), found.information
 
-    def judged(information: np.ndarray) -> tuple[Identifiability, ...]:
+    def verdicts(information: np.ndarray) -> tuple[Identifiability, ...]:
         return identifiability_of(space, information, found.config.identifiability)
 
-    def widths(information: np.ndarray) -> np.ndarray:
-        reached = np.array([t.shrinkage for t in judged(information)])[main]
-        return np.log(np.maximum(reached, MARGIN * limit))
+    def log_widths(information: np.ndarray) -> np.ndarray:
+        shrinkage = np.array([verdict.shrinkage for verdict in verdicts(information)])[main]
+        return np.log(np.maximum(shrinkage, target))
 
     each, why = dict[int, np.ndarray](), "" if candidates else _why_none(scene, recording)
     if found.open and candidates:
         try:
             each = _information(scene, space, found, recording, candidates)
-        except ValueError as error:  # what the recording tells is known all the same
+        except ValueError as error:  # the information in the recordings is valid nevertheless
             candidates, why = (), f"those that were tried cannot be replayed ({error})"
-    while each and len(chosen) < MOST and np.any(widths(total) > np.log(limit * MARGIN)):
-        before = widths(total)
-        gains = {k: float(np.sum(before - widths(total + i))) for k, i in each.items()}
+    while each and len(chosen) < config.most and np.any(log_widths(total) > np.log(target)):
+        before = log_widths(total)
+        gains = {k: float(np.sum(before - log_widths(total + i))) for k, i in each.items()}
         best = max(gains, key=lambda k: gains[k] / candidates[k].time[-1])
-        if gains[best] < LEAST:
+        if gains[best] < config.least_gain:
             break
         chosen.append(candidates[best])
         total = total + each[best]
-    for picked in list(chosen):  # what a later one tells too needs no time
-        rest = total - each[candidates.index(picked)]
-        if np.all(widths(rest) <= np.maximum(widths(total), np.log(limit * MARGIN))):
-            chosen.remove(picked)
-            total = rest
-    after = judged(total)
-    now = {t.name for t in after if t.identifiable}
-    if not now.intersection(found.open):  # narrower, but none of them enough
-        chosen, after = [], judged(found.information)
+    for motion in list(chosen):  # a later motion may have made an earlier one superfluous
+        without = total - each[candidates.index(motion)]
+        if np.all(log_widths(without) <= np.maximum(log_widths(total), np.log(target))):
+            chosen.remove(motion)
+            total = without
+    after = verdicts(total)
+    identifiable = {verdict.name for verdict in after if verdict.identifiable}
+    if not identifiable.intersection(found.open):  # the posteriors are narrower, but none is narrow enough
+        chosen, after = [], verdicts(found.information)
     return MotionProposal(
         chosen=tuple(chosen),
         identifiability=after,
-        opened=tuple(name for name in found.open if name in now),
-        left=tuple(name for name in found.open if name not in now),
+        opened=tuple(name for name in found.open if name in identifiable),
+        left=tuple(name for name in found.open if name not in identifiable),
         joints=joints,
         start=start,
         tried=len(candidates),
@@ -216,42 +221,44 @@ def propose(
 def _information(
     scene: Scene, space: Space, found: Excitation, recording: Recording, candidates: Sequence[Addition]
 ) -> dict[int, np.ndarray]:
-    """Number of an addition -> [D, D] information, per squared search unit."""
+    """Number of a candidate -> its information [D, D], per squared search unit."""
     motions = [motion_recording(scene, recording, addition, str(k)) for k, addition in enumerate(candidates)]
     config = found.config
     with silent():
         cost = make_cost(scene, space, motions, engine=found.engine, config=config.compare, check=False)
-    comparison = cost.comparisons[0]  # all have one clock and one filter, and what was measured cancels
+    comparison = cost.comparisons[0]  # all have one clock and one filter, and the measurement cancels in differences
     channels = []
     for channel in comparison.channels:
-        of = found.noise[channel.name]
-        usual = float(np.median(list(of.values())))
+        noise = found.noise[channel.name]
+        median = float(np.median(list(noise.values())))
         names = [scene.joints[c] if c < len(scene.joints) else "" for c in channel.columns.tolist()]
-        deviation = np.array([max(usual, of.get(name, usual)) for name in names])  # at rest a joint shows less of it
+        # The residual of a joint at rest underestimates its noise.
+        deviation = np.array([max(median, noise.get(name, median)) for name in names])
         channels.append(replace(channel, noise=channel.noise.stated(deviation)))
-    one = cost.first().compared_by([replace(comparison, channels=tuple(channels))])
+    first = cost.first().compared_by([replace(comparison, channels=tuple(channels))])
     rollouts, steps = slopes(cost, space, space.to_search(found.values), config.step)
     out = dict[int, np.ndarray]()
     for k, rollout in enumerate(rollouts):
-        jacobian = jacobian_of(one.whitened_of([rollout]), steps) / found.widening
+        jacobian = jacobian_of(first.whitened_of([rollout]), steps) / found.widening
         out[k] = jacobian.T @ jacobian
     return out
 
 
 def motion_recording(scene: Scene, recording: Recording, addition: Addition, name: str) -> Recording:
-    """An addition as a recording of one repeat, whose measurements are made up: only its replay is looked at."""
+    """Return an addition as a recording of one repeat, with placeholder measurements: only its replay is used."""
     joints, start = _start(scene, recording)
     table = np.tile(start, (len(addition.time), 1))
     table[:, joints.index(addition.joint)] = addition.path
     shape = (1, len(addition.time), len(joints))
-    changing = np.tile(np.linspace(0.0, 1.0, shape[1])[None, :, None], (1, 1, shape[2]))  # lest it count as dead
+    # Placeholders increase with time, since constant channels are refused.
+    placeholder = np.tile(np.linspace(0.0, 1.0, shape[1])[None, :, None], (1, 1, shape[2]))
     channels = dict[str, Channel]()
-    for key in COLUMNS:
+    for key in CHANNELS:
         if key not in recording.channels and key != "position":
             continue
         names = recording.channels[key].columns if key in recording.channels else joints
         columns = [j for j in names if j in joints]
-        values = table[None] if key == "position" and not recording.command.size else changing
+        values = table[None] if key == "position" and not recording.command.size else placeholder
         values = values[..., [joints.index(j) for j in columns]].copy()
         unit = recording.channels[key].unit if key in recording.channels else "rad"
         channels[key] = Channel(key, unit, tuple(columns), addition.time, values, np.ones(values.shape, bool))
@@ -274,7 +281,7 @@ def motion_recording(scene: Scene, recording: Recording, addition: Addition, nam
 
 
 def _start(scene: Scene, recording: Recording) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names [U] of the joints that are sent, and where an addition begins, rad or m."""
+    """Names [U] of the commanded joints, and the start [U] of an addition, rad or m."""
     if recording.command.size:
         return recording.command_names, recording.command[0].astype(float)
     measured = recording.measured_start()
@@ -288,15 +295,20 @@ def _servos(scene: Scene) -> set[str]:
 
 
 def _gear(scene: Scene, recording: Recording, joint: str) -> float:
-    """What a joint's command is times its position."""
+    """The ratio of a joint's command to its position."""
     if not recording.command.size or joint not in scene.command_names:
         return 1.0
     u = scene.command_names.index(joint)
     return float(scene.model.actuator_gear[u, 0]) if scene.of_joint[u] else 1.0
 
 
-def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[float, float, float]:
-    """rad or m that a joint can go down and up from q, and what the ways are counted in: 1 rad, or a slide's motion."""
+def _free_range(
+    scene: Scene, recording: Recording, joint: str, q: float, config: ProposalConfig
+) -> tuple[float, float, float]:
+    """Distances rad or m that a joint can move down and up from q, and the unit of displacements.
+
+    The unit is 1 rad, or for a slide its motion in the recording.
+    """
     low, high = -np.inf, np.inf
     if joint in scene.single_joints:
         index = scene.id("joint", joint)
@@ -315,47 +327,47 @@ def _room(scene: Scene, recording: Recording, joint: str, q: float) -> tuple[flo
             else _measured(recording.channels["position"], joint)
         )
         unit = float(np.ptp(path))
-    return max(0.0, FREE * (q - low)), max(0.0, FREE * (high - q)), unit
+    return max(0.0, config.range_share * (q - low)), max(0.0, config.range_share * (high - q)), unit
 
 
-def _largest_jump(scene: Scene, recording: Recording, joint: str) -> float:
-    """rad or m by which a servo's command may jump, lest its torque reach the limit; infinite without one."""
+def _largest_step(scene: Scene, recording: Recording, joint: str, share: float) -> float:
+    """Step of a servo's command, rad or m, that demands a share of its torque limit; infinite without a limit."""
     if joint not in scene.single_joints or joint not in scene.command_names:
         return np.inf
     u, limit = scene.command_names.index(joint), min(np.abs(torque_range(scene, joint)))
     stiffness = own_stiffness(replace(scene, model=with_stated_gains(scene, recording)))[u]
-    return LIMIT * limit / stiffness if stiffness > 0 else np.inf
+    return share * limit / stiffness if stiffness > 0 else np.inf
 
 
 def _measured(channel: Channel, joint: str) -> np.ndarray:
-    """[K] what was measured of a joint, in all repeats."""
+    """[K] measured samples of a joint, of all repeats."""
     i = channel.columns.index(joint)
     return channel.values[..., i][channel.mask[..., i]]
 
 
-# Paths of -1 to 1 over a time [K], which begin and end at 0 ---------------------------------------------------
+# Shapes from -1 to 1 over a time [K], which begin and end at 0 ------------------------------------------------
 
 
 def _ramp(time: np.ndarray) -> np.ndarray:
-    """Up, down to the other side, and back, at one speed."""
+    """Up, down to the other side, and back, at constant speed."""
     return np.interp(time / time[-1], [0.0, 0.05, 0.275, 0.725, 0.95, 1.0], [0.0, 0.0, 1.0, -1.0, 0.0, 0.0])
 
 
 def _steps(time: np.ndarray) -> np.ndarray:
-    """To each side from the middle, so that no jump is larger than the way that is said."""
+    """Steps to each side and back to the middle, so that no step is larger than 1."""
     levels = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 0.0])
     return levels[np.minimum((time / time[-1] * len(levels)).astype(int), len(levels) - 1)]
 
 
-def _chirp(time: np.ndarray) -> np.ndarray:
-    """A swing whose frequency grows exponentially."""
-    first, last = CHIRP
+def _chirp(time: np.ndarray, config: ProposalConfig) -> np.ndarray:
+    """A sine whose frequency grows exponentially."""
+    first, last = config.chirp
     growth = np.log(last / first) / time[-1]
-    ease: Callable[[np.ndarray], np.ndarray] = lambda t: np.clip(t / EASE, 0.0, 1.0)  # noqa: E731
-    return ease(time) * ease(time[-1] - time) * np.sin(2 * np.pi * first * np.expm1(growth * time) / growth)
+    fade_in, fade_out = (np.clip(t / config.ease, 0.0, 1.0) for t in (time, time[-1] - time))
+    return fade_in * fade_out * np.sin(2 * np.pi * first * np.expm1(growth * time) / growth)
 
 
 def _hold(time: np.ndarray) -> np.ndarray:
-    """Away in a quarter of the time, and back in another."""
+    """To another pose in the first quarter of the time, and back in the last."""
     share = time / time[-1]
     return minimum_jerk(np.clip(np.minimum(share, 1.0 - share) / 0.25, 0.0, 1.0))

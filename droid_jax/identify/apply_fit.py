@@ -1,4 +1,4 @@
-"""A fit in plain MuJoCo: this one file needs numpy and mujoco, nothing else.
+"""A fit in plain MuJoCo.  This file needs only numpy and mujoco.
 
     import mujoco, apply_fit
 
@@ -7,15 +7,15 @@
     values = apply_fit.apply(spec, fit)                     # the fitted values; sample=7 takes draw number 7
     model = spec.compile()
     data = mujoco.MjData(model)
-    laws = apply_fit.forces(model, fit, values)             # what no MJCF can hold; nothing where there is nothing
+    laws = apply_fit.forces(model, fit, values)             # laws that MJCF cannot express, if there are any
     for command in commands:
-        data.ctrl[:] = laws.control(data, command)          # a servo's ramps, a delay, a gear that gives way
-        laws(model, data)                                   # a latch, a friction that goes with the load
+        data.ctrl[:] = laws.control(data, command)          # a servo's ramps, a delay, an elastic gear
+        laws(model, data)                                   # a latch, a friction that depends on the load
         mujoco.mj_step(model, data)
 
-`mujoco.set_mjcb_control(laws)` serves in place of `laws(model, data)`.  `batch(model, fit, 4096)` gives draws as arrays
-by field, for engines that step many worlds.  fitted.json says what its entries mean (docs/results-folder.md of
-droid_jax).  Draw `k` of a seed is the same wherever and how often it is asked for.
+`mujoco.set_mjcb_control(laws)` can replace `laws(model, data)`.  `batch(model, fit, 4096)` returns draws as arrays by
+field, for engines that step many worlds.  docs/results-folder.md of droid_jax describes the entries of fitted.json.
+Draw `k` of a seed is the same in every call.
 """
 
 from __future__ import annotations
@@ -32,26 +32,29 @@ import mujoco
 import numpy as np
 
 FORMAT, VERSION = "droid_jax fitted", 1
-TRIES, SWEEPS = 2000, 40  # rows drawn until one is within the bounds; after that rounds of Gibbs sampling
-FIRST_TRIES = 20  # of these, which mostly suffice
-ALIKE = 1e-9  # relative: what mj_setConst works out anew of the same numbers differs by rounding
+TRIES, SWEEPS = 2000, 40  # rows drawn until one is inside the bounds; then sweeps of Gibbs sampling
+FIRST_TRIES = 20  # rows of the first block of these, which usually suffices
+SAME = 1e-9  # relative; mj_setConst reproduces a model's derived numbers up to rounding
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
 _AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_NAMED = ("table", "inertias")  # parts whose entries name an element
-_UNIT = ("body_quat", "jnt_axis", "geom_quat")
+_NAMED = ("table", "inertias")  # parts of fitted.json whose entries name an element
+_UNIT = ("body_quat", "jnt_axis", "geom_quat")  # fields of unit vectors
+# Fields from which mj_setConst derives others.
 _DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
              "jnt_axis", "geom_pos", "geom_quat"}  # fmt: skip
-_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
-_PLACE = {"body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size"}
+_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # fields of a body's inertia
+_PLACE = {"body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size"}  # fields of a frame or a shape
+# Prefixes of the fields of a model's elements.
 _OF_ELEMENTS = ("body_", "jnt_", "dof_", "qpos", "geom_", "site_", "pair_", "actuator_", "tendon_", "eq_", "cam_",
                 "light_")  # fmt: skip
-_SHAPED = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))
-_SURE = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
-         "actuator_gainprm", "actuator_biasprm")  # fmt: skip
+_SHAPED = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # geoms with a frame of their data
+# Fields that a compiled spec must reproduce.
+_REPRODUCED = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
+               "actuator_gainprm", "actuator_biasprm")  # fmt: skip
 
 
 def load(path: str | Path) -> dict[str, Any]:
-    """The content of a fitted.json; ValueError for another file or version."""
+    """Return the content of a fitted.json; ValueError for another file or version."""
     content = json.loads(Path(path).read_text(encoding="utf-8"))
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise ValueError(f"{path}: expected a JSON object with format {FORMAT!r}, version {VERSION}")
@@ -61,19 +64,19 @@ def load(path: str | Path) -> dict[str, Any]:
 def apply(
     target: mujoco.MjSpec | mujoco.MjModel, fit: dict[str, Any] | str | Path, sample: int | None = None, seed: int = 0
 ) -> dict[str, float]:
-    """Write the fitted values, or a draw, into a spec or a model; whatever an earlier call wrote is replaced.
+    """Write the fitted values, or a draw, into a spec or a model; they replace those of an earlier call.
 
     Args:
-        target: of the MJCF that was fitted, or of fitted.xml, a compiled model or a spec.
+        target: a spec or a compiled model, of the MJCF that was fitted or of fitted.xml.
         fit: content of fitted.json, or its path.
-        sample: None for the fitted values, a number for that draw.
+        sample: number of a draw; None for the fitted values.
         seed: of the draws.
 
     Returns:
         The values by parameter, for `forces`.
 
     Raises:
-        ValueError: the target lacks an element of the fit, or cannot say one of its numbers.
+        ValueError: the target lacks an element of the fit, or a spec cannot express one of its numbers.
     """
     fit = fit if isinstance(fit, dict) else load(fit)
     values = fitted_values(fit) if sample is None else draw(fit, sample, seed)
@@ -87,18 +90,18 @@ def apply(
 def batch(
     model: mujoco.MjModel, fit: dict[str, Any] | str | Path, count: int, seed: int = 0, prefix: str = ""
 ) -> dict[str, np.ndarray]:
-    """Draws as arrays by field of the model, for engines that step many worlds with numbers of their own.
+    """Return draws as arrays by field of the model, for engines that step many worlds with different numbers.
 
     Args:
-        model: compiled, of the MJCF that was fitted or of a scene that holds it.  It is not changed.
+        model: compiled, of the MJCF that was fitted or of a scene that contains it.  It is not changed.
         fit: content of fitted.json, or its path.
-        count: draws, at least 1; row k is what `apply(model, fit, sample=k, seed=seed)` writes.
+        count: number of draws, at least 1; row k is what `apply(model, fit, sample=k, seed=seed)` writes.
         seed: of the draws.
-        prefix: before the names of the fitted MJCF's elements in this scene, "robot/".
+        prefix: of the names of the fitted MJCF's elements in this scene, for example "robot/".
 
     Returns:
-        {field: [count, *shape of the field]} of the fields that differ from the model's in a draw: what is written,
-        and what MuJoCo derives from it (`dof_invweight0`).  The laws of `forces` are in none of them.
+        {field: [count, *shape of the field]} of the fields that differ from the model's in some draw: those that the
+        fit writes, and those that MuJoCo derives from them (`dof_invweight0`).  The laws of `forces` are not fields.
 
     Raises:
         ValueError: count is below 1, or the model lacks an element of the fit.
@@ -109,7 +112,7 @@ def batch(
     if prefix:
         if nameless := sorted({f"{row['element']} {row['id']}" for row in fit["table"] if not row["name"]}):
             raise ValueError(f"{', '.join(nameless)}: give it a name in the MJCF and fit again to find it by a prefix")
-        prefixed = {part: [{**of, "name": prefix + of["name"]} for of in fit.get(part, ())] for part in _NAMED}
+        prefixed = {part: [{**e, "name": prefix + e["name"]} for e in fit.get(part, ())] for part in _NAMED}
         fit = {**fit, **prefixed}
     written, names = copy.copy(model), [p["name"] for p in fit["parameters"]]
     old = {field: getattr(model, field) for field in dir(model) if field.startswith(_OF_ELEMENTS)}
@@ -119,21 +122,21 @@ def batch(
         _write(written, fit, dict(zip(names, row, strict=True)))
         for field, rows in new.items():
             rows[k] = getattr(written, field)
-    return {field: rows for field, rows in new.items() if not np.allclose(rows, old[field], rtol=ALIKE, atol=1e-12)}
+    return {field: rows for field, rows in new.items() if not np.allclose(rows, old[field], rtol=SAME, atol=1e-12)}
 
 
 def fitted_values(fit: dict[str, Any]) -> dict[str, float]:
-    """The fitted values by parameter."""
+    """Return the fitted values by parameter."""
     return {p["name"]: p["value"] for p in fit["parameters"]}
 
 
 def draw(fit: dict[str, Any], sample: int, seed: int = 0) -> dict[str, float]:
-    """Draw number `sample` of the Gaussian, by parameter, within the bounds."""
+    """Return draw number `sample` of the Gaussian inside the bounds, by parameter."""
     return dict(zip((p["name"] for p in fit["parameters"]), draws(fit, [sample], seed)[0].tolist(), strict=True))
 
 
 def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
-    """[n, D] these draws, physical units, in the order of fit["parameters"]."""
+    """Return draws [n, D] of these numbers, in physical units and the order of fit["parameters"]."""
     gaussian, parameters = fit["gaussian"], fit["parameters"]
     mean, cov = np.array(gaussian["mean"]), np.array(gaussian["cov"])
     physical = gaussian["coordinates"] == "physical"
@@ -155,7 +158,7 @@ def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
 
 
 def _box(p: dict[str, Any], physical: bool) -> tuple[float, float]:
-    """Bounds that a draw must keep, in the Gaussian's coordinates."""
+    """Bounds of a draw, in the Gaussian's coordinates."""
     if physical:
         return p["low"], p["high"]
     if p["scaling"] == "log":  # its map clips
@@ -180,7 +183,7 @@ def _physical(p: dict[str, Any], x: np.ndarray, physical: bool) -> np.ndarray:
 def _gibbs(
     rng: np.random.Generator, mean: np.ndarray, cov: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """A draw of a normal of which hardly anything lies within the bounds: one coordinate after the other."""
+    """A draw of a normal distribution with little probability inside the bounds, by Gibbs sampling."""
     normal, precision = NormalDist(), np.linalg.pinv(cov, hermitian=True)
     x = np.clip(mean, low, high)
     for _ in range(SWEEPS):
@@ -189,7 +192,7 @@ def _gibbs(
                 continue
             std = precision[i, i] ** -0.5
             centre = mean[i] - (precision[i] @ (x - mean) - precision[i, i] * (x[i] - mean[i])) / precision[i, i]
-            sign = -1.0 if low[i] > centre else 1.0  # in the tail that has digits
+            sign = -1.0 if low[i] > centre else 1.0  # the tail whose probabilities are accurate
             ends = sorted(sign * (end - centre) / std for end in (low[i], high[i]))
             first, last = (0.5 * math.erfc(-end / math.sqrt(2.0)) for end in ends)
             share = min(max(first + rng.uniform() * (last - first), 1e-300), 1 - 1e-15)
@@ -198,12 +201,12 @@ def _gibbs(
 
 
 def _id(model: mujoco.MjModel, row: dict[str, Any]) -> int:
-    """Id of a row's element, by its name where it has one."""
+    """Id of a row's element, by its name if it has one."""
     if not row["name"]:
         return int(row["id"])
     kind = getattr(mujoco.mjtObj, f"mjOBJ_{row['element'].upper()}")
     found = mujoco.mj_name2id(model, kind, row["name"])
-    if found < 0 and row["element"] == "actuator":  # one without a name goes by its joint's
+    if found < 0 and row["element"] == "actuator":  # an actuator without a name has the name of its joint
         joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, row["name"])
         drives = np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0))
         found = int(drives[0]) if joint >= 0 and len(drives) else -1
@@ -223,7 +226,7 @@ def _entry(model: mujoco.MjModel, row: dict[str, Any]) -> tuple[int, ...]:
 
 
 def number_of(row: dict[str, Any], values: dict[str, float]) -> float:
-    """A row's number for parameter values: its nominal one, changed by each parameter in turn."""
+    """Return a row's number for parameter values: the nominal one, modified by each parameter in turn."""
     number = row["nominal"]
     for write in row["writes"]:
         w = write["gain"] * values[write["parameter"]] + write["offset"]
@@ -235,10 +238,10 @@ def number_of(row: dict[str, Any], values: dict[str, float]) -> float:
 
 
 def inertia_of(inertia: dict[str, Any], values: dict[str, float]) -> dict[str, np.ndarray]:
-    """Mass, centre, orientation and moments of a body of `inertias` for parameter values.
+    """Return mass, centre, orientation and moments of a body of `inertias` for parameter values.
 
-    Its pseudo-inertia is (U A)(U A)', U being `root` and A upper triangular: e^mass times stretches, shears and shifts.
-    Rucker and Wensing, IEEE RA-L 2022.
+    The pseudo-inertia is (U A)(U A)^T with U the `root`, and A upper triangular: e^mass times stretches, shears and
+    shifts.  Source: Rucker and Wensing, IEEE RA-L 2022.
     """
     size, x, y, z, xy, yz, xz, *shift = (
         0.0 if write is None else write["gain"] * values[write["parameter"]] + write["offset"]
@@ -248,33 +251,34 @@ def inertia_of(inertia: dict[str, Any], values: dict[str, float]) -> dict[str, n
         [np.exp(x), xy, xz, shift[0]], [0, np.exp(y), yz, shift[1]], [0, 0, np.exp(z), shift[2]], [0, 0, 0, 1],
     ])  # fmt: skip
     scaled = np.array(inertia["root"]) @ factor * np.exp(size)
-    whole = scaled @ scaled.T
-    mass, centre = whole[3, 3], whole[:3, 3] / whole[3, 3]
-    extents, axes = np.linalg.eigh(whole[:3, :3] - mass * np.outer(centre, centre))
+    pseudo = scaled @ scaled.T
+    mass, centre = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+    second_moments, axes = np.linalg.eigh(pseudo[:3, :3] - mass * np.outer(centre, centre))
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    turned = np.zeros(4)
-    mujoco.mju_mat2Quat(turned, axes.ravel())
+    orientation = np.zeros(4)
+    mujoco.mju_mat2Quat(orientation, axes.ravel())
     return {
-        "body_mass": np.array(mass), "body_ipos": centre, "body_iquat": turned, "body_inertia": extents.sum() - extents,
+        "body_mass": np.array(mass), "body_ipos": centre, "body_iquat": orientation,
+        "body_inertia": second_moments.sum() - second_moments,
     }  # fmt: skip
 
 
 def _write(model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
-    """The numbers of a compiled model, and what MuJoCo derives from them."""
-    fields, turned = set(), set()
+    """Write the numbers into a compiled model, and update those that MuJoCo derives from them."""
+    fields, moved_frames = set(), set()
     for row in fit["table"]:
         getattr(model, row["field"])[_entry(model, row)] = number_of(row, values)
         fields.add(row["field"])
         if row["field"] in ("body_ipos", "body_iquat"):
-            turned.add(_id(model, row))
+            moved_frames.add(_id(model, row))
         elif row["field"] in ("jnt_pos", "jnt_axis"):
-            turned.add(int(model.jnt_bodyid[_id(model, row)]))
+            moved_frames.add(int(model.jnt_bodyid[_id(model, row)]))
     for inertia in fit.get("inertias", ()):
         body = _id(model, {"element": "body", **inertia})
         for field, number in inertia_of(inertia, values).items():
             getattr(model, field)[body] = number
-        turned.add(body)
-    for body in turned:  # what C would take a short cut by
+        moved_frames.add(body)
+    for body in moved_frames:  # the shortcuts of C for aligned frames do not apply any more
         if model.body_simple[body]:
             model.dof_simplenum[:] = 0
         model.body_sameframe[body] = model.body_simple[body] = 0
@@ -287,12 +291,12 @@ def _write(model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float])
         model.stat.meanmass = model.body_subtreemass[0] / max(model.nbody - 1, 1)
     for geom in {_id(model, row) for row in fit["table"] if row["field"] == "geom_size"}:
         _bound(model, geom)
-    if fields & {"geom_pos", "geom_quat", "geom_size"}:  # boxes around several geoms stay as they were compiled
+    if fields & {"geom_pos", "geom_quat", "geom_size"}:  # bounding volumes of several geoms are not updated
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
 
 
 def _bound(model: mujoco.MjModel, geom: int) -> None:
-    """Radius and box around a geom of a primitive shape, as MuJoCo compiles them."""
+    """Set the bounding sphere and box of a geom of a primitive shape, as MuJoCo compiles them."""
     x, y, z = model.geom_size[geom]
     around = {
         mujoco.mjtGeom.mjGEOM_SPHERE: ((x, x, x), x),
@@ -306,15 +310,15 @@ def _bound(model: mujoco.MjModel, geom: int) -> None:
 
 
 def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any]) -> None:
-    """The elements of a spec, as they are in a compiled model."""
-    weighed = set()
+    """Write the numbers of a compiled model into the elements of its spec."""
+    bodies = set()
     if any(row["field"] in _WEIGHT for row in fit["table"]):
-        _settle(spec, model)
+        _state_derived(spec, model)
     for row in fit["table"]:
         number, field = _id(model, row), row["field"]
         element = _element(spec, row["element"], number)
         if field in _WEIGHT:
-            weighed.add(number)
+            bodies.add(number)
         elif row["spec"]:
             entry = _entry(model, row)
             numbers = np.atleast_1d(getattr(model, field)[entry[0]])
@@ -324,8 +328,8 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
                         raise ValueError(
                             f"geom {row['name'] or number!r} has the frame of its mesh: write into its compiled MjModel"
                         )
-                    if model.geom_bodyid[number]:  # whose weight a compiler would derive from its geoms
-                        weighed.add(int(model.geom_bodyid[number]))
+                    if model.geom_bodyid[number]:  # the compiler would derive its body's inertia from the geoms
+                        bodies.add(int(model.geom_bodyid[number]))
                 _unplace(element)
                 for each in ("pos", "quat", "size"):
                     if hasattr(element, each):
@@ -334,20 +338,22 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
             if row["angle"] and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
                 numbers = np.degrees(numbers)
             _set(element, row["spec"], numbers)
-    for body in weighed:
+    for body in bodies:
         element = _element(spec, "body", body)
         element.explicitinertial, element.mass = True, float(model.body_mass[body])
         element.ipos, element.iquat = model.body_ipos[body].tolist(), model.body_iquat[body].tolist()
         element.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         element.inertia, element.fullinertia = model.body_inertia[body].tolist(), [np.nan] * 6
-    made = spec.compile()
-    other = [f for f in _SURE if not np.allclose(getattr(made, f), getattr(model, f), rtol=1e-4, atol=1e-7)]
-    if other:
-        raise ValueError(f"the spec makes another {', '.join(other)} of these numbers: write into its compiled MjModel")
+    compiled = spec.compile()
+    different = [
+        f for f in _REPRODUCED if not np.allclose(getattr(compiled, f), getattr(model, f), rtol=1e-4, atol=1e-7)
+    ]
+    if different:
+        raise ValueError(f"the spec compiles to another {', '.join(different)}: write into its compiled MjModel")
 
 
-def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """State what a compiler would derive from other masses: total mass, damping ratios."""
+def _state_derived(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """State numbers that the compiler would derive from the masses: total mass, damping ratios."""
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:
@@ -359,7 +365,7 @@ def _element(spec: mujoco.MjSpec, kind: str, number: int) -> Any:
 
 
 def _unplace(element: Any) -> None:
-    """Take an element out of its frame, and forget every other way in which its place was said."""
+    """Take an element out of its frame, and clear alternative attributes of its pose."""
     if element.frame is not None:
         element.set_frame(element.parent.add_frame())
     element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -377,16 +383,16 @@ def _set(element: Any, attribute: str, numbers: np.ndarray) -> None:
 
 
 def forces(model: mujoco.MjModel, fit: dict[str, Any] | str | Path, values: dict[str, float] | None = None) -> Laws:
-    """The laws that no MJCF can hold, at these values (default: the fitted ones); call it after `apply`."""
+    """Return the laws that MJCF cannot express, at these values (None: the fitted ones); call it after `apply`."""
     fit = fit if isinstance(fit, dict) else load(fit)
     return Laws(model, fit, fitted_values(fit) if values is None else values)
 
 
 class Laws:
-    """Laws of a fit on a model: `laws(model, data)` before each step, or as MuJoCo's control callback.
+    """The laws of a fit on a model: call `laws(model, data)` before each step, or use it as MuJoCo's control callback.
 
-    It sets `qfrc_applied` and the friction loss of the joints that have a law; a force of your own on one of them goes
-    into `own` [nv].  `control` gives the controls that the actuators get in place of the commanded ones.
+    It sets `qfrc_applied` and the friction loss of the joints that have a law.  Add your own forces on these joints to
+    `own` [nv].  `control` returns the controls of the actuators for a command.
     """
 
     def __init__(self, model: mujoco.MjModel, fit: dict[str, Any], values: dict[str, float]) -> None:
@@ -411,24 +417,25 @@ class Laws:
             {"force": self._force, "frictionloss": self._friction, "servo": self._servo}[law["acts"]].append(made)
         if self.delay < 0:
             warnings.warn(
-                f"the fitted command comes {-self.delay:.4g} s early, which nothing can do: it is not", stacklevel=3
+                f"the fitted delay of the command is {self.delay:.4g} s; a negative delay is not applied", stacklevel=3
             )
             self.delay = 0.0
-        self._rubbed = np.array(sorted({t.dof for t in self._friction}), dtype=int)
-        model.dof_frictionloss[self._rubbed] = np.maximum(model.dof_frictionloss[self._rubbed], TINY_FRICTION)
+        self._friction_dofs = np.array(sorted({t.dof for t in self._friction}), dtype=int)
+        rubbed = self._friction_dofs
+        model.dof_frictionloss[rubbed] = np.maximum(model.dof_frictionloss[rubbed], TINY_FRICTION)
         self._base = model.dof_frictionloss.copy()
-        self._pushed = np.array(sorted({t.dof for t in self._force}), dtype=int)
+        self._force_dofs = np.array(sorted({t.dof for t in self._force}), dtype=int)
         self._sent: list[tuple[float, np.ndarray]] = []
 
     def force(self, data: mujoco.MjData) -> np.ndarray:
-        """[nv] generalised force of the laws in this state."""
+        """Return the generalised force [nv] of the laws in this state."""
         out = np.zeros(self.model.nv)
         for table in self._force:
             out[table.dof] += table(data)
         return out
 
     def frictionloss(self, data: mujoco.MjData) -> np.ndarray:
-        """[nv] friction loss with the laws in this state; the load is the actuators' torque of the last step."""
+        """Return the friction loss [nv] with the laws in this state; the load is the actuators' last torque."""
         out = self._base.copy()
         for table in self._friction:
             before = out[table.dof]
@@ -436,19 +443,21 @@ class Laws:
         return out
 
     def __call__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Set the forces and frictions of this state."""
-        if len(self._pushed):
-            data.qfrc_applied[self._pushed] = (self.force(data) + self.own)[self._pushed]
-        if len(self._rubbed):
+        """Set the forces and friction losses of this state."""
+        forced, rubbed = self._force_dofs, self._friction_dofs
+        if len(forced):
+            data.qfrc_applied[forced] = (self.force(data) + self.own)[forced]
+        if len(rubbed):
             loss = self.frictionloss(data)
-            model.dof_frictionloss[self._rubbed] = np.maximum(loss[self._rubbed], TINY_FRICTION)
+            model.dof_frictionloss[rubbed] = np.maximum(loss[rubbed], TINY_FRICTION)
             rows = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
-            rows = rows[np.isin(data.efc_id[rows], self._rubbed)]  # as a callback: they stand there already
+            rows = rows[np.isin(data.efc_id[rows], rubbed)]  # in a callback the constraint rows exist already
             data.efc_frictionloss[rows] = loss[data.efc_id[rows]]
 
     def control(self, data: mujoco.MjData, command: Any) -> np.ndarray:
-        """[nu] what the actuators get for a command [nu] given at data.time: along the servos' own ramps, later by the
-        delay, through the gears.
+        """Return the actuators' controls [nu] for a command [nu] at data.time.
+
+        The servos' profiles, the delay and the elastic gears are applied, in this order.
         """
         ctrl = np.array(command, dtype=float)
         if self._goals:
@@ -465,12 +474,13 @@ class Laws:
         return self._geared(data, ctrl) if self._servo else ctrl
 
     def _late(self, time: float) -> np.ndarray:
+        """The controls that were sent at a time, interpolated."""
         (t0, first), (t1, second) = self._sent[0], self._sent[min(1, len(self._sent) - 1)]
         share = 1.0 if t1 == t0 else min(max((time - t0) / (t1 - t0), 0.0), 1.0)
         return first + share * (second - first) if t1 != t0 else first
 
     def _geared(self, data: mujoco.MjData, ctrl: np.ndarray) -> np.ndarray:
-        """Controls at which the servos give the torque that a gear which gives way lets through."""
+        """Controls with which the servos' torques equal those of elastic gears."""
         m, out = self.model, ctrl.copy()
         for table in self._servo:
             u = _drive(m, table.joint)
@@ -482,36 +492,36 @@ class Laws:
 
 
 def _drive(model: mujoco.MjModel, joint: int) -> int:
-    """The actuator of a joint; of several the one that follows a place."""
-    own = (model.actuator_trnid[:, 0] == joint) & np.isin(model.actuator_trntype, _AT_JOINT)
-    follows = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
-    return int(np.flatnonzero(own & follows if (own & follows).any() else own)[0])
+    """The actuator of a joint; if there are several, the one with position feedback."""
+    at_joint = (model.actuator_trnid[:, 0] == joint) & np.isin(model.actuator_trntype, _AT_JOINT)
+    servo = (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE) & (model.actuator_biasprm[:, 1] != 0)
+    return int(np.flatnonzero(at_joint & servo if (at_joint & servo).any() else at_joint)[0])
 
 
 class _Goal:
-    """The place that a servo follows in place of its command: it speeds up, or moves, no faster than its limit."""
+    """The goal position that a servo follows instead of its command, with limited speed or acceleration."""
 
-    def __init__(self, actuator: int, acts: str, most: float) -> None:
-        self.actuator, self.acts, self.most = actuator, acts, most
-        self.place, self.speed = 0.0, 0.0
+    def __init__(self, actuator: int, acts: str, limit: float) -> None:
+        self.actuator, self.acts, self.limit = actuator, acts, limit
+        self.position, self.speed = 0.0, 0.0
 
     def __call__(self, command: float, step: float) -> float:
-        """The place so long [s] after the last one; it starts at the command and at rest, also where time goes back."""
+        """Return the goal `step` s after the last one; it starts at the command and at rest, also if time goes back."""
         if step <= 0:
-            self.place, self.speed = (self.place, self.speed) if step == 0 else (command, 0.0)
-            return self.place
-        way = command - self.place
+            self.position, self.speed = (self.position, self.speed) if step == 0 else (command, 0.0)
+            return self.position
+        distance = command - self.position
         if self.acts == "speed":
-            self.speed = min(max(way / step, -self.most), self.most)
+            self.speed = min(max(distance / step, -self.limit), self.limit)
         else:  # no faster than it can brake
-            wanted = math.copysign(min(abs(way) / step, math.sqrt(2 * self.most * abs(way))), way)
-            self.speed += min(max(wanted - self.speed, -self.most * step), self.most * step)
-        self.place += self.speed * step
-        return self.place
+            wanted = math.copysign(min(abs(distance) / step, math.sqrt(2 * self.limit * abs(distance))), distance)
+            self.speed += min(max(wanted - self.speed, -self.limit * step), self.limit * step)
+        self.position += self.speed * step
+        return self.position
 
 
 class _Table:
-    """A law on one joint, linear between nodes, and as at the last one beyond."""
+    """A law on one joint, piecewise linear between nodes and constant beyond them."""
 
     def __init__(self, joint: int, dof: int, qpos: int, axes: list[tuple[str, np.ndarray]], table: Any) -> None:
         self.joint, self.dof, self.qpos, self.axes, self.table = joint, dof, qpos, axes, np.asarray(table)
@@ -525,7 +535,7 @@ class _Table:
         return self.at([float(state[name][0][state[name][1]]) for name, _ in self.axes])
 
     def at(self, x: list[float]) -> float:
-        """The law at values of its variables."""
+        """Return the law at values of its variables."""
         table = self.table
         for value, (_, nodes) in zip(x, self.axes, strict=True):
             table = _between(table, nodes, value)
@@ -533,7 +543,7 @@ class _Table:
 
 
 def _between(table: np.ndarray, nodes: np.ndarray, x: float) -> np.ndarray:
-    """A table at a value of its first axis."""
+    """A table interpolated at a value of its first axis."""
     if len(nodes) == 1:
         return table[0]
     low = min(max(int(np.searchsorted(nodes, x)) - 1, 0), len(nodes) - 2)
@@ -542,7 +552,7 @@ def _between(table: np.ndarray, nodes: np.ndarray, x: float) -> np.ndarray:
 
 
 def _at(table: np.ndarray, shapes: list[dict[str, Any]], values: dict[str, float]) -> np.ndarray:
-    """A table at values of its shape parameters, which are its first axes."""
+    """A table interpolated at values of its shape parameters, which are its first axes."""
     for axis in shapes:
         table = _between(table, np.array(axis["nodes"]), values[axis["name"]])
     return table

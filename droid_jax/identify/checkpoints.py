@@ -1,9 +1,9 @@
-"""Numbered checkpoints of a loop that may be killed: save every few steps, resume from the newest good one.
+"""Numbered checkpoints of a loop that may be killed: save every few steps, resume from the newest intact one.
 
-Any loop whose state is a nested dictionary of numpy arrays can use them.  A checkpoint is a folder,
-written by orbax under a temporary name and renamed when complete.  Beside the arrays it holds a
-fingerprint, what the state belongs to, and a digest over both and the number of the step, because a
-damaged file is not always one that cannot be read, and a folder can be renamed.
+They serve any loop whose state is a nested dictionary of numpy arrays.  A checkpoint is a folder, which orbax writes
+under a temporary name and renames when it is complete.  It also holds a fingerprint of the loop's configuration and
+data, and a digest of the arrays, the fingerprint and the step's number.  The digest detects damaged files that can
+still be read, and renamed folders.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ import orbax.checkpoint as ocp
 
 from droid_jax import distributed
 
-MOST_BYTES = 2**30  # of a checkpoint's arrays, which are read whole; a search with 1024 samples writes 10 MB
+MOST_BYTES = 2**30  # largest size of a checkpoint's arrays that is read; a search with 1024 samples writes 10 MB
 Tree = dict[str, Any]  # nested dictionary whose leaves are numpy arrays, none of them empty
 
-# what orbax and the store below it raise where a checkpoint cannot be written
-_DAMAGE = (ValueError, KeyError, TypeError, OSError, RuntimeError)
+_WRITE_ERRORS = (ValueError, KeyError, TypeError, OSError, RuntimeError)  # of orbax and the store below it
 
 
 class Checkpoints:
     """The checkpoints of one loop in one folder; use as a context manager, or close().
 
-    folder:      created when missing; belongs to this loop alone.
-    keep:        how many of the newest checkpoints stay on disk.
-    fingerprint: named texts that say what the loop's state belongs to (its configuration, its data);
-                 a checkpoint with other texts is refused.
+    folder: created if missing; it belongs to this loop alone.
+    keep: number of the newest checkpoints that stay on disk.
+    fingerprint: named texts that identify the loop (its configuration, its data); a checkpoint with other texts is
+      refused.
     """
 
     def __init__(self, folder: str | Path, *, keep: int = 3, fingerprint: Mapping[str, str] | None = None):
@@ -61,15 +60,17 @@ class Checkpoints:
         self._manager.close()
 
     def steps(self) -> list[int]:
-        """Steps that have a checkpoint on disk, oldest first; some may turn out to be damaged."""
+        """Return the steps that have a checkpoint on disk, oldest first; some may be damaged."""
         return sorted(self._manager.all_steps())
 
     def save(self, step: int, tree: Tree) -> None:
         """Write the state after `step` steps.
 
-        Checkpoints of this step or a later one are removed first: they are damaged ones that a
-        resumed loop has passed over, and would otherwise count as the newest.  In a run of several processes the
-        first one saves.
+        Checkpoints of this step or a later one are removed first.  They are damaged ones that `restore` skipped, and
+        would otherwise count as the newest.  In a run of several processes only the first one saves.
+
+        Raises:
+            OSError: the checkpoint cannot be written.
         """
         if not distributed.first():
             return
@@ -81,19 +82,21 @@ class Checkpoints:
         try:
             with _quiet():
                 self._manager.save(step, args=items, force=True)
-        except _DAMAGE as error:
+        except _WRITE_ERRORS as error:
             raise _not_written(self.folder / str(step), error) from error
 
     def restore(self) -> tuple[int, Tree] | None:
-        """(step, tree) of the newest checkpoint that is whole; None when there is none.
+        """Return (step, tree) of the newest intact checkpoint, or None if there is none.
 
-        Warns about every damaged checkpoint it passes over, with its path and what is wrong.
-        Raises ValueError when the newest whole checkpoint has another fingerprint.
+        A warning names every damaged checkpoint that is skipped, and its fault.
+
+        Raises:
+            ValueError: the newest intact checkpoint has another fingerprint.
         """
         for step in reversed(self.steps()):
             try:
                 found, tree = self._read(step)
-            except Exception as error:  # orbax and the stores below it raise many kinds on changed bytes
+            except Exception as error:  # orbax and the stores below it raise many types for damaged files
                 warnings.warn(
                     f"checkpoint {self.folder / str(step)} is damaged and was passed over: {_first_line(error)}",
                     stacklevel=2,
@@ -104,7 +107,7 @@ class Checkpoints:
         return None
 
     def _read(self, step: int) -> tuple[dict[str, str], Tree]:
-        """Fingerprint and tree of one checkpoint; raises anything when it is not as written."""
+        """Fingerprint and tree of one checkpoint; raises any exception for a damaged one."""
         self._check_size(step)
         items = ocp.args.Composite(state=ocp.args.StandardRestore(), meta=ocp.args.JsonRestore())
         read = self._manager.restore(step, args=items)
@@ -114,7 +117,7 @@ class Checkpoints:
         return fingerprint, read["state"]
 
     def _check_size(self, step: int) -> None:
-        """ValueError where a checkpoint declares more than is read: a damaged shape must not fill the memory."""
+        """Raise ValueError if a checkpoint declares more than MOST_BYTES: a damaged shape must not fill the memory."""
         folder = self.folder / str(step)
         described = (folder / "meta" / "metadata").stat().st_size
         arrays = jax.tree.leaves(ocp.StandardCheckpointHandler().metadata(cast(Any, folder / "state")).tree)
@@ -123,32 +126,32 @@ class Checkpoints:
             raise ValueError(f"it declares {declared / 2**20:.0f} MiB, at most {MOST_BYTES >> 20} MiB are read")
 
     def _check_fingerprint(self, step: int, found: dict[str, str]) -> None:
-        """ValueError that names the texts in which a checkpoint differs from this loop."""
+        """Raise ValueError with the names of the texts in which a checkpoint differs from this loop."""
         keys = sorted(set(found) | set(self.fingerprint))
-        other = [k for k in keys if found.get(k) != self.fingerprint.get(k)]
-        if other:
+        different = [k for k in keys if found.get(k) != self.fingerprint.get(k)]
+        if different:
             raise ValueError(
                 f"checkpoint {self.folder / str(step)} belongs to another run: it differs in "
-                f"{', '.join(other)}; use another folder, or remove this one to start over"
+                f"{', '.join(different)}; use another folder, or remove this one to start over"
             )
 
 
 def _options(folder: Path, keep: int) -> ocp.CheckpointManagerOptions:
-    """orbax's options, under which each process of a run has its folder to itself."""
+    """orbax's options, with which the processes of a run do not wait for each other."""
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
     if distributed.count() == 1:
         return options
     folder.mkdir(parents=True, exist_ok=True)
-    me = distributed.index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
+    index = distributed.index()
+    independent = ocp.options.MultiprocessingOptions(
+        primary_host=index, active_processes={index}, barrier_sync_key_prefix=f"process_{index}"
     )
-    return replace(options, create=False, multiprocessing_options=alone)
+    return replace(options, create=False, multiprocessing_options=independent)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without orbax's warning of what a killed run has left half written, which it removes."""
+    """Suppress orbax's warning of a killed run's incomplete checkpoints, which it removes."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -178,15 +181,15 @@ def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _not_written(path: Path, error: BaseException) -> OSError:
-    """The file system's error behind one of the store's, which says it in a text of its own; names the checkpoint."""
+    """An OSError that names the checkpoint; its errno is found in the text of the store's error, which has none."""
     number = error.errno if isinstance(error, OSError) else None
     if number is None:
         known = {os.strerror(code).lower(): code for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)}
         number = next((code for text, code in known.items() if text in str(error).lower()), errno.EIO)
-    told = os.strerror(number) if number != errno.EIO else _first_line(error)
-    return OSError(number, f"the checkpoint cannot be written: {told}", str(path))
+    reason = os.strerror(number) if number != errno.EIO else _first_line(error)
+    return OSError(number, f"the checkpoint cannot be written: {reason}", str(path))
 
 
 def _first_line(error: BaseException) -> str:
-    """Kind and first line of an error, for a message of one line."""
+    """Type and first line of an error, for a message of one line."""
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:300]}"

@@ -1,8 +1,8 @@
-"""CMA-ES as evosax has it, for several restarts at once, with recombination weights of our own.
+"""The CMA-ES of evosax for several restarts at once, with other recombination weights.
 
-The algebra is evosax's; the weights are ours, because evosax gives half of the population a
-positive weight whatever `elite_ratio` says, and gives rows with equal costs the weight of their
-average rank.  Everything random comes from fold_in(key(seed), generation).
+evosax gives half of the population a positive weight whatever `elite_ratio` is, and gives rows with equal costs the
+weight of their average rank.  So the weights are computed here; the rest of the algorithm is evosax's.  All randomness
+comes from fold_in(key(seed), generation).
 References "Tutorial" are to Hansen, The CMA Evolution Strategy: A Tutorial, arXiv 1604.00772.
 """
 
@@ -22,7 +22,7 @@ from droid_jax.model.parameters import Space
 
 
 class Recombination(NamedTuple):
-    """Weights of the ranked rows, and the learning rates that follow from them (Tutorial, Table 1)."""
+    """Weights of the ranked rows, and the learning rates that depend on them (Tutorial, Table 1)."""
 
     weights: np.ndarray  # [P], best row first; the positive ones sum to 1
     mu_eff: float
@@ -34,9 +34,13 @@ class Recombination(NamedTuple):
 
 
 def recombination(population: int, parents: int, dims: int, active: bool) -> Recombination:
-    """Weights log(parents + 1/2) - log(rank): exactly the `parents` best rows have a positive one.
+    """Return weights log(parents + 1/2) - log(rank): exactly the `parents` best rows have a positive weight.
 
-    active gives the other rows negative weights (Tutorial, eqs. 50-53) in place of zero.
+    Args:
+        population: rows P.
+        parents: rows with a positive weight.
+        dims: parameters D.
+        active: whether the other rows get negative weights (Tutorial, eqs. 50-53) instead of zero.
     """
     raw = math.log(parents + 0.5) - np.log(np.arange(1, population + 1))  # [P]
     mu_eff = raw[:parents].sum() ** 2 / (raw[:parents] ** 2).sum()
@@ -55,21 +59,22 @@ def recombination(population: int, parents: int, dims: int, active: bool) -> Rec
 
 
 class Strategy:
-    """evosax's CMA-ES for all restarts at once, on one device; leading axis [R] of restarts.
+    """The CMA-ES of evosax for all restarts at once, on one device; arrays have a leading axis [R] of restarts.
 
-    That device is a CPU where there is one: the matrices are tiny, and the draws are then the same on
-    every machine.
+    The device is a CPU if there is one.  The matrices are small, and the draws are then the same on every machine.
 
-    sigma:  initial step in search coordinates.
-    seeds:  [R], one per restart.
-    redraws: draw rows again in which a linearly scaled parameter is out of bounds, and clip what is
-            still outside after so many draws; 0 leaves the clipping to the space.
+    space: meaning of the D entries.
+    weights: of the ranked rows.
+    sigma: initial step in search coordinates.
+    seeds: [R], one for each restart.
+    redraws: draws per row, of which the first with all linearly scaled parameters inside their bounds is taken.  A row
+      that is still outside is clipped.
     """
 
     def __init__(self, space: Space, weights: Recombination, *, sigma: float, seeds: Sequence[int], redraws: int):
         self.space, dims = space, len(space)
         self._device = _one_device()
-        box = redraw_box(space) if redraws else (np.full(dims, -np.inf), np.full(dims, np.inf))
+        box = redraw_box(space)
         with jax.default_device(self._device):
             self._kernels = _kernels(len(weights.weights), dims, redraws if np.isfinite(box).any() else 1)
         params = self._kernels.params.replace(std_init=sigma, **weights._asdict())
@@ -79,26 +84,26 @@ class Strategy:
         self._seeds = self._put(np.asarray(seeds))
 
     def init(self, centre: np.ndarray) -> Any:
-        """State of every restart at its start [R, D], physical values."""
+        """Return the state of every restart at its start [R, D], physical values."""
         x = self._put(np.asarray(self.space.to_search(centre), np.float32))
         return self._kernels.init(self._seeds, x, self._params)
 
     def ask(self, state: Any, generation: int) -> tuple[np.ndarray, Any]:
-        """Populations [R, P, D] in search coordinates, and the state with its axes brought up to date."""
+        """Return populations [R, P, D] in search coordinates, and the state with its principal axes updated."""
         number = self._put(np.int32(generation))
         x, state = self._kernels.ask(self._seeds, number, state, self._params, self._box)
         return np.asarray(x), state
 
     def tell(self, state: Any, x: np.ndarray, costs: np.ndarray, running: np.ndarray) -> Any:
-        """State after costs [R, P] of x [R, P, D]; unchanged where a restart is not running [R]."""
-        # ranks, not costs: float64 costs that float32 cannot tell apart keep their order
+        """Return the state updated with costs [R, P] of x [R, P, D]; unchanged for a restart not `running` [R]."""
+        # Ranks instead of costs: float64 costs that are equal in float32 keep their order.
         ranks = np.argsort(np.argsort(costs, axis=1, kind="stable"), axis=1)
         fitness = np.where(np.isfinite(costs), ranks, np.inf).astype(np.float32)
-        told = (self._put(a) for a in (x, fitness, running & np.isfinite(costs).any(axis=1)))
-        return self._kernels.tell(state, *told, self._params, self._bounds)
+        arrays = (self._put(a) for a in (x, fitness, running & np.isfinite(costs).any(axis=1)))
+        return self._kernels.tell(state, *arrays, self._params, self._bounds)
 
     def put_state(self, state: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-        """A copy of a state with its arrays replaced."""
+        """Return a copy of a state with its arrays replaced."""
         return state.replace(**{name: self._put(a) for name, a in arrays.items()})
 
     def _put(self, tree: Any) -> Any:
@@ -123,11 +128,11 @@ def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
 
     def init(seed: Any, x: Any, params: Any) -> Any:
         state = evosax.init(jax.random.key(seed), x, params)
-        # Of the types that `tell` returns: evosax's weak ones would compile everything a second time.
+        # The types that `tell` returns: with evosax's weak types everything would be compiled twice.
         return jax.tree.map(lambda a: jax.lax.convert_element_type(a, a.dtype), state)
 
     def ask(seed: Any, generation: Any, state: Any, params: Any, box: Any) -> tuple[Any, Any]:
-        """One restart's rows [P, D]: per row, its first draw inside the box [2, D]."""
+        """One restart's rows [P, D], each the first of its draws inside the box [2, D]."""
         keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), generation), redraws)
         draw = jax.vmap(lambda key: evosax.ask(key, state, params), out_axes=(0, None))
         draws, state = draw(keys)  # [K, P, D]
@@ -137,9 +142,9 @@ def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
         return jnp.clip(x, box[0], box[1]), state
 
     def tell(state: Any, x: Any, fitness: Any, running: Any, params: Any, bounds: Any) -> Any:
-        """One restart's update, its mean held inside the bounds [2, D]."""
-        new, _ = evosax.tell(jax.random.key(0), x, fitness, state, params)  # evosax draws nothing here
-        # beyond the bounds a clipped cost is flat and the mean would wander off for good
+        """One restart's update, with its mean clipped to the bounds [2, D]."""
+        new, _ = evosax.tell(jax.random.key(0), x, fitness, state, params)  # evosax does not use this key
+        # Far beyond the bounds clipped draws all cost the same, and the mean would diverge.
         new = new.replace(mean=jnp.clip(new.mean, bounds[0], bounds[1]))
         return jax.tree.map(lambda a, b: jnp.where(running, a, b), new, state)
 
@@ -159,7 +164,7 @@ def _ranked_weights(population: jax.Array, fitness: jax.Array, state: Any, param
 
 
 def _one_device() -> Any:
-    """A CPU device of this process, or its first device where jax was told to leave the CPU out."""
+    """A CPU device of this process, or its first device if jax does not use the CPU."""
     try:
         return jax.local_devices(backend="cpu")[0]
     except RuntimeError:

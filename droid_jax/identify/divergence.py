@@ -1,4 +1,4 @@
-"""Why a replay gives no numbers: which joint leaves its range first, when, and what its servo would need."""
+"""Why a replay blew up: the joint that left its range first, when, and the time step that its servo needs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from droid_jax.model.actuators import drives_joint
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.scene import Scene
 
-FAR = 30.0  # rad or m from zero that a joint without a range does not come to: some five turns
-WIDTHS = 1.0  # of its range, by which a joint with one has left it for good
+UNLIMITED_RANGE = 30.0  # rad or m from zero, some five turns, beyond which a joint without a range has blown up
+RANGE_MARGIN = 1.0  # widths of its range beyond which a joint with one has blown up
 
 
 def blow_up(scene: Scene, rollout: Rollout) -> str:
-    """What is to be said of a replay of one sample that blew up, in a clause; empty where no joint shows it.
+    """Return a clause that explains why a replay of one sample blew up; empty if no joint shows it.
 
     Args:
         scene: of the replay.
@@ -22,42 +22,42 @@ def blow_up(scene: Scene, rollout: Rollout) -> str:
     position, time = np.asarray(rollout.position, np.float64), np.asarray(rollout.time, np.float64)
     if not position.size:
         return ""
-    bounds = np.array([_far(scene, joint) for joint in scene.joints])  # [J, 2]
+    bounds = np.array([_blow_up_bounds(scene, joint) for joint in scene.joints])  # [J, 2]
     with np.errstate(invalid="ignore"):
-        gone = ~((position >= bounds[:, 0]) & (position <= bounds[:, 1]))
-    gone |= ~np.isfinite(np.asarray(rollout.velocity)) | ~np.isfinite(np.asarray(rollout.torque))
-    rows = np.flatnonzero(gone.any(axis=1))
+        outside = ~((position >= bounds[:, 0]) & (position <= bounds[:, 1]))
+    outside |= ~np.isfinite(np.asarray(rollout.velocity)) | ~np.isfinite(np.asarray(rollout.torque))
+    rows = np.flatnonzero(outside.any(axis=1))
     if not rows.size:
         return ""
     row = int(rows[0])
     with np.errstate(invalid="ignore", over="ignore"):
         speed = np.nan_to_num(np.abs(np.asarray(rollout.velocity, np.float64)[max(row - 1, 0)]), nan=np.inf)
-    first = max(np.flatnonzero(gone[row]), key=lambda j: speed[j])
-    joint = scene.joints[first]
-    return f"{joint} leaves its range at step {row} ({time[row]:.3g} s){_needs(scene, joint)}"
+    fastest = max(np.flatnonzero(outside[row]), key=lambda j: speed[j])
+    joint = scene.joints[fastest]
+    return f"{joint} leaves its range at step {row} ({time[row]:.3g} s){_stability_limit(scene, joint)}"
 
 
-def _far(scene: Scene, joint: str) -> tuple[float, float]:
-    """Where a joint has left its range for good, rad or m."""
+def _blow_up_bounds(scene: Scene, joint: str) -> tuple[float, float]:
+    """Positions of a joint, rad or m, beyond which its replay has blown up."""
     low, high = scene.model.jnt_range[scene.id("joint", joint)]
-    beyond = WIDTHS * (high - low)
-    return (low - beyond, high + beyond) if low < high else (-FAR, FAR)
+    margin = RANGE_MARGIN * (high - low)
+    return (low - margin, high + margin) if low < high else (-UNLIMITED_RANGE, UNLIMITED_RANGE)
 
 
-def _needs(scene: Scene, joint: str) -> str:
-    """The time step or armature with which a joint's servo is stable, where the scene's own is not.
+def _stability_limit(scene: Scene, joint: str) -> str:
+    """A clause with the time step or armature that makes a joint's servo stable; empty if it is stable.
 
-    A servo of stiffness k on an inertia I, stepped explicitly, is stable for steps below 2 sqrt(I / k).
+    A servo of stiffness k on an inertia I, integrated explicitly, is stable for time steps below 2 sqrt(I / k).
     """
     model, dof = scene.model, scene.dof(joint)
-    mine = drives_joint(model) & (model.actuator_trnid[:, 0] == scene.id("joint", joint))
-    stiffness = float(-(model.actuator_biasprm[mine, 1] * model.actuator_gear[mine, 0] ** 2).sum())
-    weight, step = float(model.dof_invweight0[dof]), float(model.opt.timestep)
-    if stiffness <= 0 or weight <= 0 or step * np.sqrt(stiffness * weight) < 1.0:
+    servos = drives_joint(model) & (model.actuator_trnid[:, 0] == scene.id("joint", joint))
+    stiffness = float(-(model.actuator_biasprm[servos, 1] * model.actuator_gear[servos, 0] ** 2).sum())
+    inverse_inertia, step = float(model.dof_invweight0[dof]), float(model.opt.timestep)
+    if stiffness <= 0 or inverse_inertia <= 0 or step * np.sqrt(stiffness * inverse_inertia) < 1.0:
         return ""
-    limit, needed = 2.0 / np.sqrt(stiffness * weight), stiffness * step**2 / 4.0
+    limit, needed = 2.0 / np.sqrt(stiffness * inverse_inertia), stiffness * step**2 / 4.0
     unit, torque = ("kg", "N/m") if scene.slides(joint) else ("kg m2", "N m/rad")
     return (
-        f", where its servo's {stiffness:.3g} {torque} on {1.0 / weight:.2g} {unit} need a time step well below "
-        f"{1e3 * limit:.2g} ms, or armature well above {needed:.2g} {unit}"
+        f", where its servo's {stiffness:.3g} {torque} on {1.0 / inverse_inertia:.2g} {unit} need a time step well "
+        f"below {1e3 * limit:.2g} ms, or armature well above {needed:.2g} {unit}"
     )

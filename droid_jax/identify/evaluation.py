@@ -1,4 +1,4 @@
-"""A fitted model on recordings: replays before and after the fit beside what was measured, in physical units.
+"""Evaluation of a fitted model on recordings: errors of its replays before and after the fit, in physical units.
 
     replays = evaluate_on(scene, space, recordings, before=space.mean, after=best)
 
@@ -42,9 +42,10 @@ from droid_jax.storage import finite
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """A recording and its replay at two parameter vectors.
+    """A recording and its replays at two parameter vectors.
 
     clock: [T] s, of the replays' rows on the recording's clock.  before, after: host arrays of one sample.
+    errors: by channel.
     """
 
     recording: Recording
@@ -55,7 +56,7 @@ class Replayed:
 
     @property
     def blown_up(self) -> list[str]:
-        """Which of "before" and "after" gave no numbers to the end."""
+        """Which of the replays "before" and "after" blew up."""
         return [name for name in ("before", "after") if not bool(np.all(getattr(self, name).finite))]
 
 
@@ -70,19 +71,23 @@ def evaluate_on(
     engine: str = "mjx",
     config: CompareConfig | None = None,
 ) -> list[Replayed]:
-    """Replay recordings open loop over their whole length, at two parameter vectors [D].
+    """Replay recordings open loop over their full length, at two parameter vectors.
+
+    Measured torques without the weight of the links are left out of the errors, with a warning, if the joints carry
+    weight in the simulation.
 
     Args:
         scene: what is simulated.
         space: meaning of the vectors.
-        recordings: with whatever channels were measured.
-        before: the initial means, say.
-        after: the fitted values.
-        effects: in the model beside what the scene has.
+        recordings: with at least one channel that their replay produces.
+        before: [D], for example the initial means.
+        after: [D] fitted values.
+        effects: in the model in addition to the scene.
         engine: "mjx", "mujoco" (plain C), or "auto": `simulate.engine.choose_engine` chooses.
         config: how commands are replayed; None for the defaults.
 
-    Torques that hold no weight, of joints that feel one, are left out of the errors, with a warning.
+    Returns:
+        The replays and their errors, in the recordings' order.
 
     Raises:
         ValueError: a recording without any channel that its replay produces, or what `make_cost` refuses.
@@ -97,18 +102,18 @@ def evaluate_on(
     for given in recordings:
         recording = own_starts(given, config.start)
         informative_channels(scene, [recording])
-        judged = _weighable(scene, recording, config)
-        named = dict.fromkeys(measured_channels(scene, judged), 1.0)
-        follows = followed(scene, recording, replace(config, channels=named))
+        compared = _with_comparable_torques(scene, recording, config)
+        channels = dict.fromkeys(measured_channels(scene, compared), 1.0)
+        follows = followed(scene, recording, replace(config, channels=channels))
         replay = compiled_replay(engine, scene, space, follows, effects, config.mj_step)
         rollouts, clock = in_blocks(replay, rows), replay_clock(recording, follows)
         pair = sample_of(rollouts, 0), sample_of(rollouts, 1)
-        out.append(Replayed(recording, clock, *pair, channel_errors(scene, judged, clock, *pair)))
+        out.append(Replayed(recording, clock, *pair, channel_errors(scene, compared, clock, *pair)))
     return out
 
 
-def _weighable(scene: Scene, recording: Recording, config: CompareConfig) -> Recording:
-    """The recording, without torques that its replay cannot be compared with where it has other channels."""
+def _with_comparable_torques(scene: Scene, recording: Recording, config: CompareConfig) -> Recording:
+    """The recording without torques that its replay cannot be compared with, if it has other channels."""
     if not recording.command.size or len(measured_channels(scene, recording)) < 2:
         return recording
     try:
@@ -120,7 +125,7 @@ def _weighable(scene: Scene, recording: Recording, config: CompareConfig) -> Rec
 
 
 def evaluation_json(replays: Sequence[Replayed], fitted: Sequence[str] = ()) -> dict[str, Any]:
-    """The errors as plain data; fitted: hashes of recordings that the model was fitted to."""
+    """Return the errors as plain data; fitted: sha256 of the recordings that the model was fitted to."""
     mean = mean_errors({r.recording.name: r.errors for r in replays})
     units = {name: e.unit for r in replays for name, e in r.errors.items()}
     return {
@@ -144,26 +149,25 @@ def evaluation_json(replays: Sequence[Replayed], fitted: Sequence[str] = ()) -> 
 
 
 def evaluation_traces(scene: Scene, replays: Sequence[Replayed]) -> dict[str, np.ndarray]:
-    """Measured and simulated channels over time, for figures: under recording/channel."""
+    """Return measured and simulated channels over time for figures, with keys recording/channel/name."""
     out: dict[str, np.ndarray] = {}
     for replayed in replays:
         for channel in _channels(scene, replayed):
             lines = [simulated_channel(scene, channel, replayed.clock, r) for r in (replayed.before, replayed.after)]
-            place = f"{replayed.recording.name}/{channel.name}"
+            prefix = f"{replayed.recording.name}/{channel.name}"
             measured = np.where(channel.mask, channel.values, np.nan)
             with np.errstate(all="ignore"):
                 low, high = np.fmin.reduce(measured, axis=0), np.fmax.reduce(measured, axis=0)
             count = np.maximum(channel.mask.sum(axis=0), 1)
             mean = np.where(channel.mask, channel.values, 0.0).sum(axis=0) / count
-            seen = channel.mask.any(axis=0)
             out |= {
-                f"{place}/time": channel.time,
-                f"{place}/measured_mean": np.where(seen, mean, np.nan),
-                f"{place}/measured_low": low,
-                f"{place}/measured_high": high,
-                f"{place}/before": lines[0],
-                f"{place}/after": lines[1],
-                f"{place}/joints": np.array(channel.columns),
+                f"{prefix}/time": channel.time,
+                f"{prefix}/measured_mean": np.where(channel.mask.any(axis=0), mean, np.nan),
+                f"{prefix}/measured_low": low,
+                f"{prefix}/measured_high": high,
+                f"{prefix}/before": lines[0],
+                f"{prefix}/after": lines[1],
+                f"{prefix}/joints": np.array(channel.columns),
             }
     return out
 

@@ -1,8 +1,8 @@
-"""Which parameters a motion can tell, before any fit: from the sensitivity of its replay.
+"""Which parameters a motion makes identifiable, before any fit, from the sensitivities of its replay.
 
-The replay is differentiated at the initial means and, since these may be far from the robot, again where a few
-Levenberg-Marquardt steps from there lead.  What the replay leaves there and its slopes are then judged by the rules of
-a fit: the width of its Gaussian (`posterior`), and when a parameter is identifiable.
+The replay is differentiated at the initial means.  Since these may be far from the robot, a few Levenberg-Marquardt
+steps follow, and the replay is differentiated again.  The last residuals and Jacobian give the width of a Gaussian by
+the rules of a fit (`posterior`), and with it which parameters are identifiable.
 Source: Gautier and Khalil, Exciting trajectories for the identification of base inertial parameters, IJRR 1992.
 """
 
@@ -18,12 +18,12 @@ from functools import partial
 import jax
 import numpy as np
 
-from droid_jax.arguments import check_fields, instance, number, whole
+from droid_jax.arguments import check_fields, instance, number, several, whole
 from droid_jax.cost.channels import check_channels, chosen_channels
 from droid_jax.cost.cost import Cost, make_cost
-from droid_jax.cost.residuals import CompareConfig, Comparison, restated
+from droid_jax.cost.residuals import CompareConfig, Comparison, with_estimated_noise
 from droid_jax.identify.gaussian import Gaussian
-from droid_jax.identify.holdout import beginning
+from droid_jax.identify.holdout import BeginningConfig, beginning
 from droid_jax.identify.identifiability import Identifiability, IdentifiabilityConfig, identifiability, posterior
 from droid_jax.identify.levenberg_marquardt import (
     LevenbergMarquardtConfig,
@@ -39,52 +39,106 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_no_path_in_c, why_not_in_c
 
-DAMPINGS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1000.0)  # of the trial steps, as shares of the curvature
-LENGTHS = (1.0, 0.5, 0.2)  # shares of a whole step: with the dampings one block of a CPU
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """Settings of the motions that are proposed (`identify.additions`); all are design choices.
+
+    seconds: duration of each motion.
+    rate: Hz, of a motion beside a recording without commands.
+    ramp, step, swing, hold: rad, largest displacement of a slow ramp, steps, a chirp and a hold elsewhere.  For a slide
+      they are factors on its own motion in the recording.
+    chirp: Hz, first and last frequency of a chirp.
+    ease: s, in which a chirp begins and ends.
+    torque_share: share of a servo's torque limit that a step may demand at once.
+    range_share: share of the distance to the end of a joint's range that a motion may use.
+    margin: share of the limit of identifiability that a posterior width should reach.
+    least_gain: decrease of the summed logarithms of widths below which a motion is not added.
+    most: largest number of motions.
+    """
+
+    seconds: float = 6.0
+    rate: float = 100.0
+    ramp: float = 0.6
+    step: float = 0.3
+    swing: float = 0.1
+    hold: float = 0.8
+    chirp: tuple[float, ...] = (0.3, 2.0)
+    ease: float = 0.5
+    torque_share: float = 0.5
+    range_share: float = 0.9
+    margin: float = 0.8
+    least_gain: float = 0.05
+    most: int = 8
+
+    def __post_init__(self) -> None:
+        above, share = partial(number, above=0), partial(number, above=0, most=1)
+        check_fields(
+            self,
+            **dict.fromkeys(("seconds", "rate", "ramp", "step", "swing", "hold", "ease"), above),
+            **dict.fromkeys(("torque_share", "range_share", "margin"), share),
+            chirp=several(above, 2),
+            least_gain=partial(number, least=0),
+            most=partial(whole, least=0),
+        )
+        if self.chirp[0] == self.chirp[1]:
+            raise ValueError(f"chirp must have two different frequencies, got {self.chirp}")
 
 
 @dataclass(frozen=True)
 class ExcitationConfig:
-    """What decides which parameters a motion can tell.
+    """Settings of the sensitivities, and of when a parameter counts as identifiable.
 
-    seconds: of each recording that are replayed; what a longer one tells is taken to grow with its length.
+    seconds: of each recording that are replayed; the information is scaled with the length of a longer one.
+    beginning_rule: when a recording is longer, and how much of it is replayed.
     step: half-width of the differences, search units.
-    steps: Levenberg-Marquardt steps from the initial means at most; they end where
-    worth: one lowers the objective by no more than this share.
-    longest_step: of each of their components, search units.
+    steps: largest number of Levenberg-Marquardt steps from the initial means.
+    worth: share of the objective; a step that lowers it by less is the last.
+    longest_step: largest component of a step, search units.
+    dampings: of the candidate steps, shares of the curvature's diagonal.
+    lengths: factors on each full step; with `dampings` one block of rows on a CPU in MJX.
     compare: how simulation and measurement are compared.
     identifiability: when a parameter counts as identifiable.
+    proposal: the motions that are proposed for parameters that are not.
     """
 
     seconds: float = 20.0
+    beginning_rule: BeginningConfig = field(default_factory=BeginningConfig)
     step: float = 0.1
     steps: int = 12
     worth: float = 0.05
     longest_step: float = 2.0
+    dampings: tuple[float, ...] = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1000.0)
+    lengths: tuple[float, ...] = (1.0, 0.5, 0.2)
     compare: CompareConfig = field(default_factory=CompareConfig)
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
+    proposal: ProposalConfig = field(default_factory=ProposalConfig)
 
     def __post_init__(self) -> None:
         check_fields(
             self,
             **dict.fromkeys(("seconds", "step", "longest_step"), partial(number, above=0)),
+            beginning_rule=partial(instance, kind=BeginningConfig),
             worth=partial(number, least=0, below=1),
             steps=partial(whole, least=0),
+            dampings=several(partial(number, above=0)),
+            lengths=several(partial(number, above=0, most=1)),
             compare=partial(instance, kind=CompareConfig),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
+            proposal=partial(instance, kind=ProposalConfig),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """What recordings tell of the parameters of a space.
+    """The information in recordings about the parameters of a space.
 
-    values: [D] where the replay was differentiated.
+    values: [D] at which the replay was differentiated.
     information: [D, D] of the data, per squared search unit, by the fit's rule of the width.
     widening: [D] factors by which that rule widens deviations.
     identifiability: of each parameter.
-    noise: channel -> joint -> white deviation at the noise model's coarse rate.
-    config: with the channels that were compared.  engine: that replayed.  seconds: that this took.
+    noise: channel -> joint -> standard deviation of white noise at the noise model's coarse rate.
+    config: settings, with the channels that were compared.  engine: of the replays.  seconds: duration of the analysis.
     """
 
     space: Space
@@ -101,16 +155,16 @@ class Excitation:
     def open(self) -> tuple[str, ...]:
         """Names of the parameters of interest that are not identifiable."""
         return tuple(
-            t.name
-            for t, p in zip(self.identifiability, self.space.parameters, strict=True)
-            if not (t.identifiable or p.nuisance)
+            verdict.name
+            for verdict, p in zip(self.identifiability, self.space.parameters, strict=True)
+            if not (verdict.identifiable or p.nuisance)
         )
 
 
 def excitation(
     scene: Scene, space: Space, recordings: Sequence[Recording], config: ExcitationConfig | None = None
 ) -> Excitation:
-    """Which parameters recordings can tell that are fitted together.
+    """Return which parameters are identifiable from recordings that are fitted together.
 
     Args:
         scene: with its nominal values.
@@ -119,7 +173,7 @@ def excitation(
         config: settings; None for the defaults.
 
     Returns:
-        What they tell.
+        The information in the recordings, and the verdict for each parameter.
 
     Raises:
         ValueError: recordings or parameters that do not fit the scene, or means that cannot be simulated.
@@ -130,21 +184,20 @@ def excitation(
     if chosen:
         config = replace(config, compare=replace(config.compare, channels=dict.fromkeys(chosen, 1.0)))
     check_channels(recordings, config.compare.channels)
-    short = [beginning(recording, config.seconds) for recording in recordings]
+    short = [beginning(recording, config.seconds, config.beginning_rule) for recording in recordings]
     engine = engine_for(scene, space, short)
     with silent():
         cost = make_cost(scene, space, short, engine=engine, config=config.compare, check=False)
     refined, cost = _stepped(cost, space, config, engine)
     gaussian = posterior(refined, cost.comparisons, config.identifiability)
-    longer = sum(r.duration for r in recordings) / sum(s.duration for s in short)
-    known = np.linalg.inv(gaussian.cov) - np.eye(len(space))
-    plain = np.linalg.inv(refined.jacobian.T @ refined.jacobian + np.eye(len(space)))
-    information = longer * known
+    length_ratio = sum(r.duration for r in recordings) / sum(s.duration for s in short)
+    information = length_ratio * (np.linalg.inv(gaussian.cov) - np.eye(len(space)))
+    gauss_newton = np.linalg.inv(refined.jacobian.T @ refined.jacobian + np.eye(len(space)))
     return Excitation(
         space=space,
         values=refined.best,
         information=information,
-        widening=np.sqrt(np.maximum(1.0, np.diag(gaussian.cov) / np.diag(plain))),
+        widening=np.sqrt(np.maximum(1.0, np.diag(gaussian.cov) / np.diag(gauss_newton))),
         identifiability=identifiability_of(space, information, config.identifiability),
         noise=_noise_of(scene, cost.comparisons),
         config=config,
@@ -156,14 +209,17 @@ def excitation(
 def identifiability_of(
     space: Space, information: np.ndarray, config: IdentifiabilityConfig
 ) -> tuple[Identifiability, ...]:
-    """What data of an information [D, D], per squared search unit, tell of each parameter beside its stated prior."""
+    """Return the verdict for each parameter from data of an information [D, D] and the stated prior.
+
+    information: per squared search unit.
+    """
     cov = np.linalg.inv(information + np.eye(len(space)))
-    gaussian = Gaussian(space, np.zeros(len(space)), 0.5 * (cov + cov.T), "sensitivity beside the stated prior")
+    gaussian = Gaussian(space, np.zeros(len(space)), 0.5 * (cov + cov.T), "sensitivities and the stated prior")
     return identifiability(gaussian, np.ones(len(space)), config)
 
 
 def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> str:
-    """Plain C where it can replay the recordings, which compiles nothing; else MJX."""
+    """Return "mujoco" if plain C can replay the recordings, since it needs no compilation; else "mjx"."""
     contacts = scene.grip is not None or scene.model.npair
     for recording in recordings:
         if recording.command.size and (contacts or why_not_in_c(scene, space, recording.torque, ())):
@@ -175,30 +231,31 @@ def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> s
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Without the warnings of a replay, which `check` shows as findings."""
+    """Suppress the warnings of a replay, which `check` shows as findings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def slopes(cost: Cost, space: Space, x: np.ndarray, step: float) -> tuple[tuple[Rollout, ...], np.ndarray]:
-    """Replays at search coordinates x [D], row 0, and with each a step further, rows 1 to D; and the steps [D].
+    """Return replays for a Jacobian by one-sided differences, and the steps [D].
 
-    A step goes down where a bound is in the way.
+    Row 0 is at search coordinates x [D], and rows 1 to D are a step further along one coordinate each.  A step is
+    negative if the upper bound is closer.
     """
-    up = np.where(x + step <= space.to_search(space.high), step, -step)
-    return cost.rollouts(space.from_search(np.vstack([x, x + np.diag(up)]))), up
+    steps = np.where(x + step <= space.to_search(space.high), step, -step)
+    return cost.rollouts(space.from_search(np.vstack([x, x + np.diag(steps)]))), steps
 
 
 def jacobian_of(residuals: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """[M, D] slopes from residuals [1 + D, M] of `slopes`; 0 where a replay failed."""
+    """Return the Jacobian [M, D] of residuals [1 + D, M] of `slopes`; 0 where a replay blew up."""
     return np.nan_to_num((residuals[1:] - residuals[0]) / steps[:, None]).T
 
 
 def _stepped(cost: Cost, space: Space, config: ExcitationConfig, engine: str) -> tuple[Refined, Cost]:
-    """Where a few Levenberg-Marquardt steps lead from the means, and the cost with its noise stated from there.
+    """The result of a few Levenberg-Marquardt steps from the means, and the cost with the noise estimated there.
 
-    The steps are taken in the noise that is known before a fit; what they leave then tells the noise of one repeat.
+    The steps use the noise that is known before a fit.  Their residuals then give the noise of single repeats.
     """
     x, prior = space.to_search(space.mean), np.where(space.nuisance, 1.0, LevenbergMarquardtConfig().main_prior)
     low, high = space.to_search(space.low), space.to_search(space.high)
@@ -213,20 +270,21 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig, engine: str) ->
         jacobian = jacobian_of(residuals, steps)
         slope = jacobian.T @ residuals[0] + x / prior**2
         free = off_bounds(x, slope, low, high)
-        steps_of = curvature(jacobian, prior), slope, free, DAMPINGS
-        # A compiled block holds all lengths; in C, where each replay counts, shorter ones wait for the longer to fail.
-        tried = [LENGTHS] if engine == "mjx" else [(length,) for length in LENGTHS]
+        problem = curvature(jacobian, prior), slope, free, config.dampings
+        # A block holds all lengths.  C replays row by row, so shorter steps follow only where longer ones fail.
+        batches = [config.lengths] if engine == "mjx" else [(length,) for length in config.lengths]
         better = None
-        for lengths in tried if count < config.steps else ():
-            trials = np.clip(x + damped_steps(*steps_of, lengths, config.longest_step), low, high)
-            reached = penalised(trials, np.asarray(cost.whitened(space.from_search(trials)), np.float64), prior)
-            if np.min(reached) < (1 - config.worth) * now:
-                better = trials[int(np.argmin(reached))]
+        for lengths in batches if count < config.steps else ():
+            candidates = np.clip(x + damped_steps(*problem, lengths, config.longest_step), low, high)
+            residual = np.asarray(cost.whitened(space.from_search(candidates)), np.float64)
+            objective = penalised(candidates, residual, prior)
+            if np.min(objective) < (1 - config.worth) * now:
+                better = candidates[int(np.argmin(objective))]
                 break
         if better is None:
             break
         x, count = better, count + 1
-    cost = cost.compared_by(restated(cost.comparisons, first))
+    cost = cost.compared_by(with_estimated_noise(cost.comparisons, first))
     residuals = cost.whitened_of(rollouts)
     objective = float(penalised(x[None], np.asarray(residuals[:1], np.float64), prior)[0])
     refined = Refined(
@@ -238,16 +296,18 @@ def _stepped(cost: Cost, space: Space, config: ExcitationConfig, engine: str) ->
 
 
 def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict[str, float]]:
-    """Channel -> joint -> deviation of white noise as large as that of the repeats' mean; the smallest one.
+    """Channel -> joint -> standard deviation of white noise equivalent to that of the repeats' mean.
 
-    A whitener is triangular, so the product of its diagonal states the volume of its noise.
+    It is the smallest one over the recordings.  A whitener is triangular, so the product of its diagonal is the
+    determinant, which the equivalent white noise shares.
     """
-    found: dict[str, dict[str, float]] = {}
+    out: dict[str, dict[str, float]] = {}
     for channel in (c for comparison in comparisons for c in comparison.channels):
-        mine = found.setdefault(channel.name, {})
+        of_channel = out.setdefault(channel.name, {})
         for whitener, column in zip(channel.noise.whitener, channel.columns.tolist(), strict=True):
-            own = np.abs(np.diagonal(whitener))
-            deviation = float(np.exp(-np.mean(np.log(own[own > 0])))) if np.any(own > 0) else np.inf
+            diagonal = np.abs(np.diagonal(whitener))
+            weighted = diagonal[diagonal > 0]
+            deviation = float(np.exp(-np.mean(np.log(weighted)))) if weighted.size else np.inf
             joint = scene.joints[column] if column < len(scene.joints) else str(scene.object_joint)
-            mine[joint] = min(deviation, mine.get(joint, np.inf))
-    return found
+            of_channel[joint] = min(deviation, of_channel.get(joint, np.inf))
+    return out

@@ -1,10 +1,10 @@
-"""The extended model: base parameters and the effects that a search named, as one thing to hand on.
+"""The extended model: base parameters and the effects that a search named.
 
     extended = load_extended("runs/gap/extended.json", scene)
     cost = make_cost(extended.scene, extended.space, [recording], effects=extended.effects)
 
-extended.json always holds all of it.  extended.xml is the scene as MJCF with the fitted values; effects
-that MJCF has no words for are missing in it, and extended.json says which.
+extended.json holds the complete model.  extended.xml is the scene as MJCF with the fitted values.  It lacks the effects
+that MJCF cannot express; extended.json lists them.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ FORMAT, VERSION = "droid_jax extended model", 2
 
 @dataclass(frozen=True, eq=False)
 class Extended:
-    """A fitted model with the effects that are in it.
+    """A fitted model with its effects.
 
-    scene: with all that the effects need of it.  parts: the effects with their places.  effects: for
-    `make_cost(..., effects=...)`.  values: [D] physical, over `space`.  gaussian: over `space`, base
-    parameters first.
+    scene: prepared for the effects (`registry.ready`).  parts: the effects with their locations.
+    effects: for `make_cost(..., effects=...)`.  values: [D] physical, over `space`.
+    gaussian: over `space`, base parameters first.
     """
 
     scene: Scene
@@ -51,14 +51,15 @@ class Extended:
 
     @property
     def space(self) -> Space:
-        """Base parameters, then those of the effects at their places."""
+        """Base parameters, then those of the effects at their locations."""
         return self.gaussian.space
 
     @property
     def effect_space(self) -> Space:
-        """The effects' parameters alone, starting from the fitted values, each as wide as it ever was.
+        """The effects' parameters alone, with the fitted values as means and their prior deviations.
 
-        Raises ValueError where no effect is in the model.
+        Raises:
+            ValueError: the model has no effect.
         """
         if not self.parts:
             raise ValueError("the extended model names no effect: it is the base model")
@@ -68,16 +69,16 @@ class Extended:
 
     @property
     def lacking(self) -> Keys:
-        """The parts that an MJCF cannot hold in full: of a payload it holds the mass, and not the moment."""
+        """The parts that an MJCF cannot express completely: of a payload, for example, only the mass."""
         effects = {e.name: e for e in self.effects}
         model = make_c_model(self.scene, self.space, self.values)
-        said = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}
-        parts = (p for p in self.parts if p.effect not in said)
+        in_mjcf = {n for n, e in effects.items() if native(e, self.space, self.values, model) is not None}
+        parts = (p for p in self.parts if p.effect not in in_mjcf)
         return tuple(p.key for p in parts if not _in_mjcf(effects[p.effect], self.space.select(p.free)))
 
 
 def save_extended(folder: Path, model: Extended) -> None:
-    """Write extended.json and extended.xml into `folder`; extended.json says why where there is no MJCF."""
+    """Write extended.json and extended.xml into a folder; extended.json gives the reason if there is no MJCF."""
     mjcf: dict[str, Any] = {"file": EXTENDED_MJCF, "lacks": list(map(str, model.lacking))}
     error = write_neutral(folder, model.scene, model.gaussian, model.values, model.effects, main=EXTENDED_MJCF)
     if error:
@@ -90,13 +91,13 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
 
     Args:
         path: an extended.json.
-        scene: the one that it was fitted with; another time step is fine.
+        scene: the one that it was fitted with; the time step may differ.
 
     Returns:
-        The model, ready for `make_cost(model.scene, model.space, ..., effects=model.effects)`.
+        The model, for `make_cost(model.scene, model.space, ..., effects=model.effects)`.
 
     Raises:
-        ValueError: the file is missing or damaged, or belongs to another scene; it is named.
+        ValueError: the file is missing or damaged, or belongs to another scene; the message names it.
     """
     scene, path = instance(scene, "scene", Scene), path_of(path, "the path of an extended model")
     try:
@@ -106,7 +107,11 @@ def load_extended(path: str | Path, scene: Scene) -> Extended:
 
 
 def base_parameters(path: Path) -> tuple[Parameter, ...]:
-    """The parameters in an extended.json that are no effect's; ValueError for a file that is missing or damaged."""
+    """Return the base parameters in an extended.json.
+
+    Raises:
+        ValueError: the file is missing or damaged.
+    """
     file = _read(path)
     of_effects = {name for effect in file.effects for name in (*effect.coefficients, *effect.shape_parameters)}
     return tuple(p for p in space_of(file.space).parameters if p.name not in of_effects)
@@ -123,7 +128,7 @@ def _read(path: Path) -> _File:
 
 
 def _in_mjcf(effect: Effect, free: Space) -> bool:
-    """Whether an effect is nothing but numbers of the model that MJCF has words for; free: its parameters in use."""
+    """Whether an effect only writes numbers of the model that MJCF has attributes for; free: its free parameters."""
     laws = (effect.profile, effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     fields = [{w.field for w in p.writes} for p in free.parameters]
     return not any(laws) and all(written and written <= WORDS for written in fields)
@@ -186,8 +191,8 @@ def _to_json(model: Extended) -> dict[str, Any]:
 
 
 def _of_file(file: _File, scene: Scene) -> Extended:
-    if (own := _scene_to_json(scene)) | {"name": ""} != file.scene | {"name": ""}:
-        raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {own}")
+    if (given := _scene_to_json(scene)) | {"name": ""} != file.scene | {"name": ""}:
+        raise ValueError(f"it was fitted with another scene, {file.scene}; this one is {given}")
     space = space_of(file.space)
     free = [name for effect in file.effects for name in (*effect.coefficients, *effect.shape_parameters)]
     if without := [effect.effect for effect in file.effects if not effect.coefficients]:
@@ -202,22 +207,22 @@ def _of_file(file: _File, scene: Scene) -> Extended:
     )
     effects = library(scene, dict.fromkeys(p.effect for p in parts))
     _check_known(parts, effects, space)
-    check_space(made := ready(scene), space)
+    check_space(prepared := ready(scene), space)
     g = file.gaussian
     gaussian = Gaussian(space, matrix("mean", g.mean), matrix("cov", g.cov), g.rule, g.coordinates)
     values = space.check(np.array([file.values[name] for name in space.names]))
-    return Extended(made, parts, effects, values, gaussian)
+    return Extended(prepared, parts, effects, values, gaussian)
 
 
 def _check_known(parts: tuple[Candidate, ...], effects: tuple[Effect, ...], space: Space) -> None:
-    """ValueError unless the library still makes these effects, and of the same numbers of the model."""
-    own = {p.name: p for p in (effect_space(effects).parameters if effects else ())}
+    """Raise ValueError unless the library has these effects, with parameters that write the same numbers."""
+    in_library = {p.name: p for p in (effect_space(effects).parameters if effects else ())}
     for name in (name for part in parts for name in part.free):
-        if name not in own or own[name].writes != space[name].writes:
+        if name not in in_library or in_library[name].writes != space[name].writes:
             raise ValueError(f"the effect parameter {name!r} is not in this version's library, or another one there")
 
 
 def _scene_to_json(scene: Scene) -> dict[str, Any]:
-    """What a scene must have in common with the one that a model was fitted with: the indices that parameters write."""
+    """Names and sizes of a scene that must equal those of the fit, since parameters write by index."""
     sizes = {size: int(getattr(scene.model, size)) for size in ("nbody", "nv", "nu", "npair")}
     return {"name": scene.name, "joints": list(scene.joints), "object_joint": scene.object_joint, **sizes}

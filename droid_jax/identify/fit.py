@@ -1,6 +1,4 @@
-"""What a search is given, `search_cost`; a search under way, `CmaState`; what it returns: `Fit`, with the history of
-every restart; and where the refinement begins from there.
-"""
+"""The cost that a search minimises, its state, its result `Fit`, and the starts of the refinement after it."""
 
 from __future__ import annotations
 
@@ -16,21 +14,20 @@ from droid_jax.model.parameters import Parameter, Role, Space
 if TYPE_CHECKING:
     from droid_jax.identify.checkpoints import Tree
 
-FIRM = 4.0  # times its initial mean: the friction of a pad that does not slip
-BOUND_SHARE = 0.01  # a best value this close to a bound, as a share of the range in x, counts as on it
+BOUND_SHARE = 0.01  # of a parameter's range in x; a value closer to a bound counts as on it
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """One restart, generation by generation (G of them, P rows each); search state is after the update.
+    """One restart over G generations of P rows; the search state is that after each update.
 
-    mean:        [G, D] physical units.
-    std:         [G, D] marginal deviations, search coordinates.
-    sigma:       [G] step size.
-    best_cost:   [G] lowest cost found so far.
-    mean_cost, median_cost: [G] over the rows of the generation that did not fail; inf if all did.
-    costs:       [G, P] cost of every row, inf where it failed.
-    seconds:     [G] wall time of the generation, cost included (the first one compiles).
+    mean: [G, D] physical units.
+    std: [G, D] marginal deviations, search coordinates.
+    sigma: [G] step size.
+    best_cost: [G] lowest cost so far.
+    mean_cost, median_cost: [G] over the rows of the generation that did not fail; inf if all failed.
+    costs: [G, P] cost of every row, inf where it failed.
+    seconds: [G] wall time of the generation, cost included (the first one compiles).
     """
 
     mean: np.ndarray
@@ -44,31 +41,16 @@ class History:
 
 
 @dataclass(frozen=True, eq=False)
-class Restart:
-    """One of the independent searches: its seed, where it ended, why it stopped and its history.
-
-    best, mean: [D] physical units; cov: [D, D] sigma^2 C in search coordinates.
-    """
-
-    seed: int
-    best: np.ndarray
-    best_cost: float
-    mean: np.ndarray
-    cov: np.ndarray
-    stop: str
-    history: History
-
-
-@dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a search: the restart with the lowest cost, and all of them in `restarts`.
+    """Result of a search, of the restart with the lowest cost.
 
-    best:     [D] physical values with the lowest cost, best_cost.
-    mean:     [D] physical values of the final Gaussian's centre.
-    cov:      [D, D] of the final Gaussian in search coordinates, sigma^2 C.
-    evaluations: rows given to the cost; failed: those that came back NaN or infinite.
-    stop:     "generations", "tol_cost", "tol_sigma" or "max_seconds".
-    on_bound: names of parameters whose best value lies within 1 % of the range of a bound.
+    best: [D] physical values with the lowest cost, best_cost.
+    mean: [D] physical values of the final Gaussian's centre.
+    cov: [D, D] of the final Gaussian in search coordinates, sigma^2 C.
+    history: of the restart.
+    evaluations: rows that were evaluated, of all restarts.  failed: those with a NaN or infinite cost.
+    stop: "generations", "tol_cost", "tol_sigma" or "max_seconds".
+    on_bound: names of parameters whose best value is on a bound (`on_bound`).
     """
 
     space: Space
@@ -81,18 +63,17 @@ class Fit:
     failed: int
     stop: str
     on_bound: tuple[str, ...]
-    restarts: tuple[Restart, ...]
 
     def gaussian(self) -> Gaussian:
-        """The search distribution.  Its width depends on when the search stopped: it is no posterior."""
+        """Return the search distribution.  It is no posterior: its width depends on when the search stopped."""
         return Gaussian(self.space, self.space.to_search(self.mean), self.cov, rule="cma-es covariance")
 
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """What a progress display needs after each generation; costs over all running restarts.
+    """Numbers for a progress display after each generation; costs are over all running restarts.
 
-    seconds: wall time so far; seconds_left: at most, at the pace of the latest generations.
+    seconds: wall time so far.  seconds_left: upper limit, at the pace of the latest generations.
     """
 
     generation: int
@@ -107,54 +88,58 @@ class SearchProgress:
 def search_cost(
     cost: Callable[[np.ndarray], Any], penalty: float, full: Space, space: Space, at: np.ndarray | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """[P, d] rows over `space` -> [P] costs of them in the full one: a replay that blew up is no parent.
+    """Return the cost of rows [P, d] over `space`, [P], as a function; a replay that blew up costs infinity.
 
-    penalty: what such a replay costs (`Comparison.penalty`).
-    at: [D] where the other parameters stand; default: their means.
+    Args:
+        cost: [P, D] physical values over `full` -> [P].
+        penalty: cost of a replay that blew up (`Comparison.penalty`).
+        full: space of the cost.
+        space: of the d parameters that are searched.
+        at: [D] values of the other parameters; None for their means.
     """
 
-    def searched(rows: np.ndarray) -> np.ndarray:
-        found = np.asarray(cost(full.embed(space, rows, at)), np.float64)
-        return np.where(found == np.float32(penalty), np.inf, found)
+    def of_rows(rows: np.ndarray) -> np.ndarray:
+        costs = np.asarray(cost(full.embed(space, rows, at)), np.float64)
+        return np.where(costs == np.float32(penalty), np.inf, costs)
 
-    return searched
+    return of_rows
 
 
 def on_bound(space: Space, best: np.ndarray) -> tuple[str, ...]:
-    """Names of the parameters whose value lies within BOUND_SHARE of the range, in x, of a bound."""
+    """Return the names of the parameters whose value in `best` [D] is on a bound (`bound_of`)."""
     return tuple(p.name for p, value in zip(space.parameters, best, strict=True) if bound_of(p, float(value)))
 
 
 def bound_of(parameter: Parameter, value: float) -> Literal["lower", "upper", ""]:
-    """On which bound a value sits, within BOUND_SHARE of the range in x; empty for none."""
+    """Return the bound that a value is within BOUND_SHARE of the parameter's range in x of; empty for none."""
     low, x, high = (float(parameter.to_search(v)) for v in (parameter.low, value, parameter.high))
-    reach = BOUND_SHARE * (high - low)
-    if min(x - low, high - x) > reach:
+    tolerance = BOUND_SHARE * (high - low)
+    if min(x - low, high - x) > tolerance:
         return ""
     return "lower" if x - low <= high - x else "upper"
 
 
-REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by the code kept in checkpoints
+STOP_REASONS = ("", "tol_cost", "tol_sigma")  # why a restart stopped, by its code in checkpoints
 
 
 @dataclass(eq=False)
 class CmaState:
-    """Everything that changes while a search runs; what a checkpoint holds."""
+    """Everything that changes while a search runs; the content of a checkpoint."""
 
     state: Any  # evosax's, leading axis [R]
     generation: int
     best: np.ndarray  # [R, D] physical
     best_cost: np.ndarray  # [R]
-    stopped: np.ndarray  # [R] index into REASONS
+    stopped: np.ndarray  # [R] index into STOP_REASONS
     ended: np.ndarray  # [R] generations the restart ran
     failed: int
     records: dict[str, list[np.ndarray]] = field(default_factory=dict)  # per generation [R, ...]
 
     @staticmethod
     def fresh(state: Any, restarts: int, dims: int) -> CmaState:
-        """Of a search that has not begun."""
-        none = np.zeros(restarts, np.int64)
-        return CmaState(state, 0, np.full((restarts, dims), np.nan), np.full(restarts, np.inf), none, none.copy(), 0)
+        """Return the state of a search that has not begun."""
+        zeros = np.zeros(restarts, np.int64)
+        return CmaState(state, 0, np.full((restarts, dims), np.nan), np.full(restarts, np.inf), zeros, zeros.copy(), 0)
 
     @property
     def cov(self) -> np.ndarray:
@@ -169,7 +154,7 @@ class CmaState:
         return float(sum(float(s[0]) for s in self.records.get("seconds", [])))
 
     def tree(self) -> Tree:
-        """As nested dictionaries of arrays."""
+        """Return the state as nested dictionaries of arrays."""
         return {
             "state": {name: np.asarray(getattr(self.state, name)) for name in self.state.__dataclass_fields__},
             "records": {name: np.stack(rows) for name, rows in self.records.items()},
@@ -182,13 +167,16 @@ class CmaState:
 
     @staticmethod
     def of_tree(generation: int, tree: Tree, state: Any) -> CmaState:
-        """Inverse of tree(), with the state already on its device."""
+        """Invert `tree`; state: evosax's, already on its device."""
         records = {name: list(rows) for name, rows in tree["records"].items()}
         best, best_cost, stopped, ended = (np.array(tree[k]) for k in ("best", "best_cost", "stopped", "ended"))
         return CmaState(state, generation, best, best_cost, stopped, ended, int(tree["failed"]), records)
 
-    def keep_best(self, values: np.ndarray, costs: np.ndarray, running: np.ndarray, *, ties: bool = False) -> None:
-        """Bring every running restart's best row up to date, with `ties` also by a row that costs the same."""
+    def update_best(self, values: np.ndarray, costs: np.ndarray, running: np.ndarray, *, ties: bool = False) -> None:
+        """Update the best row of every running restart [R]; with `ties` also by a row of the same cost.
+
+        values: [R, P, D].  costs: [R, P].
+        """
         for r in np.flatnonzero(running):
             i = int(np.argmin(costs[r]))
             if costs[r, i] < self.best_cost[r] or (ties and costs[r, i] == self.best_cost[r]):
@@ -211,40 +199,49 @@ class CmaState:
         self.records.setdefault("seconds", [])
 
 
-def starts(full: Space, space: Space, found: Fit, coefficients: Sequence[str] = ()) -> np.ndarray:
-    """[S, F] where the refinement begins: the search's best, the initial means, these with a firm grip where the space
-    has the friction of one, and the search's best with effects that do not act in it (`with_acting`).
+def starts(
+    full: Space, space: Space, found: Fit, coefficients: Sequence[str] = (), *, firm_grip: float = 4.0
+) -> np.ndarray:
+    """Return the starts [S, F] of the refinement.
 
-    A grip that slips and one that never does are different basins, and neither start finds the other's.
+    They are the search's best values and the initial means.  If the space has the friction of a grip, the means with
+    higher friction are added: a grip that slips and one that does not are different basins of the objective.  The
+    search's best with neutral effects made active is added too (`with_acting`).
+
+    Args:
+        full: space of the refinement, F parameters.
+        space: of the search, part of `full`.
+        found: result of the search.
+        coefficients: names of effects' coefficients in `full`.
+        firm_grip: factor on the initial means of the friction of pads that do not slip.
     """
-    searched = full.embed(space, found.best[None])[0]
+    best = full.embed(space, found.best[None])[0]
     pads = space.of_role(Role.SLIDING_FRICTION, Role.TORSIONAL_FRICTION)
-    firm = {p.name: min(p.high, FIRM * p.mean) for p in pads}
-    return np.stack(
-        [searched, full.mean, *([full.values(firm)] if firm else []), *with_acting(full, searched, coefficients)]
-    )
+    firm = {p.name: min(p.high, firm_grip * p.mean) for p in pads}
+    return np.stack([best, full.mean, *([full.values(firm)] if firm else []), *with_acting(full, best, coefficients)])
 
 
 def with_acting(space: Space, values: np.ndarray, coefficients: Sequence[str]) -> list[np.ndarray]:
-    """`values` [F] with the effects that stand neutral on a bound a prior deviation off it; nothing where none does.
+    """Return `values` [F] with effects that are neutral on a bound moved off it by a prior deviation; one row or none.
 
-    A limit that acts and one that does not are different basins: where it is out of reach, no slope tells of it.
+    An effect that acts and one that does not may be different basins.  The derivative by a limit that is never reached
+    is zero, for example.
 
-    coefficients: of effects that the space holds, by name.
+    coefficients: names of effects' coefficients in the space.
     """
     acting = values.copy()
     for p in map(space.__getitem__, coefficients):
-        at, way = space.index(p.name), (p.mean == p.low) - (p.mean == p.high)
-        if way and bound_of(p, float(values[at])) == ("lower" if way > 0 else "upper"):
-            acting[at] = np.clip(p.mean + way * p.std, p.low, p.high)
+        at, sign = space.index(p.name), (p.mean == p.low) - (p.mean == p.high)
+        if sign and bound_of(p, float(values[at])) == ("lower" if sign > 0 else "upper"):
+            acting[at] = np.clip(p.mean + sign * p.std, p.low, p.high)
     return [] if np.array_equal(acting, values) else [acting]
 
 
 def grip_hypotheses(space: Space) -> list[dict[str, float]]:
-    """Which fingers slip: each sliding friction alone, and all, at its initial mean.
+    """Return assignments {name: value} in which fingers slip: each sliding friction, and all of them, at its mean.
 
-    Slip is a basin of its own: from a sticking finger no derivative sees it.
+    A slipping finger is a basin of its own, which the derivatives at a sticking finger do not show.
     """
     sliding = {p.name: p.mean for p in space.of_role(Role.SLIDING_FRICTION)}
-    alone = [{name: mean} for name, mean in sliding.items()]
-    return [*alone, sliding] if len(sliding) > 1 else alone
+    single = [{name: mean} for name, mean in sliding.items()]
+    return [*single, sliding] if len(sliding) > 1 else single

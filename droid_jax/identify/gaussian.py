@@ -1,15 +1,14 @@
-"""The Gaussian over parameters: what identification hands to training and to the report.
+"""The Gaussian over parameters, the result of an identification that training and the report use.
 
-A `Gaussian` is a normal distribution in one of two coordinates: `search` coordinates (see
-`droid_jax.model.parameters`), where a log-scaled parameter is log-normal in its unit, or `physical`
-ones.  It carries the rule that set its width, because a covariance without its origin cannot be
-judged: the one CMA-ES ends with shrinks with every generation and is no posterior.
+A `Gaussian` is a normal distribution in search or in physical coordinates.  In search coordinates (see
+`droid_jax.model.parameters`) a log-scaled parameter is log-normal in its unit.  A `Gaussian` also holds the rule that
+set its width, because covariances of different origin mean different things.  That of CMA-ES, for example, shrinks with
+every generation and is no posterior.
 
-Bounds.  Draws of a linearly scaled parameter (and of every parameter in physical coordinates) that
-fall outside the bounds are drawn again, whole rows at a time, as the paper redraws negative values; where
-hardly any row falls inside, Gibbs sampling draws from the same distribution (`identify.truncated_normal`).
-A log-scaled parameter in search coordinates is clipped by its map instead, so that a bound of
-exactly zero keeps the probability that lies beyond it.
+Bounds.  Rows with a linearly scaled parameter outside its bounds (any parameter in physical coordinates) are drawn
+again, as the paper redraws negative values.  If hardly any row is inside, Gibbs sampling draws from the same
+distribution (`identify.truncated_normal`).  A log-scaled parameter in search coordinates is clipped by its map instead,
+so that a bound of exactly zero holds the probability beyond it.
 
 File format (JSON, version 2)::
 
@@ -43,7 +42,7 @@ Coordinates = Literal["search", "physical"]
 
 FORMAT = "droid_jax.gaussian"
 VERSION = 2
-MIN_ACCEPTANCE = 1e-3  # below this share of draws inside the bounds, rows are no longer drawn again
+MIN_ACCEPTANCE = 1e-3  # share of draws inside the bounds below which Gibbs sampling replaces redraws
 MOMENT_POINTS = 20_001  # equal-probability points behind physical_mean and physical_std
 
 
@@ -80,26 +79,31 @@ class Gaussian:
             object.__setattr__(self, of, array)
 
     def sample(self, seed: int | np.random.Generator, n: int) -> np.ndarray:
-        """[n, D] physical values, all inside the bounds; the same seed gives the same rows."""
+        """Return n draws [n, D] in physical units, all inside the bounds.
+
+        seed: the same seed gives the same rows; or a generator.
+        """
         n = whole(n, "n, the number of draws", least=0)
         rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(whole(seed, "seed", least=0))
         low, high = self._box()
         out, filled, drawn = np.empty((n, len(self.space))), 0, 0
         while filled < n:
             draws = self._draw(rng, max(n - filled, 256))
-            kept = draws[np.all((draws >= low) & (draws <= high), axis=-1)][: n - filled]
-            out[filled : filled + len(kept)] = kept
-            filled, drawn = filled + len(kept), drawn + len(draws)
+            inside = draws[np.all((draws >= low) & (draws <= high), axis=-1)][: n - filled]
+            out[filled : filled + len(inside)] = inside
+            filled, drawn = filled + len(inside), drawn + len(draws)
             if drawn >= 20_000 and filled < MIN_ACCEPTANCE * drawn:
                 out[filled:] = gibbs(rng, n - filled, self.mean, self.cov, low, high)
                 break
         return self._to_physical(out)
 
     def log_density(self, values: np.ndarray) -> np.ndarray:
-        """[...] log density at physical values [..., D], per unit of every parameter.
+        """Return the log density [...] at physical values [..., D], per unit of every parameter.
 
-        -inf outside the bounds.  It is the density of the normal itself: not renormalised for what
-        the bounds cut off.  Raises ValueError when cov is singular.
+        It is -inf outside the bounds.  Inside it is the density of the untruncated normal.
+
+        Raises:
+            ValueError: values of another shape, or a singular `cov`.
         """
         values = numeric(values, "values")
         if values.shape[-1:] != (len(self.space),):
@@ -116,11 +120,13 @@ class Gaussian:
         return np.where(inside, -0.5 * (white**2).sum(axis=-1) - constant + log_slope, -np.inf)
 
     def quantiles(self, q: Sequence[float] | np.ndarray) -> np.ndarray:
-        """[len(q), D] marginal quantiles in physical units, for levels q [Q] between 0 and 1.
+        """Return marginal quantiles [Q, D] in physical units, for levels q [Q] between 0 and 1.
 
-        A marginal is truncated (or clipped) at its own bounds only: exact unless the bounds of
-        another, strongly correlated parameter cut rows away too.
-        Raises ValueError for other levels.
+        A marginal is truncated (or clipped) at its own bounds only.  This is exact unless the bounds of another,
+        strongly correlated parameter reject rows too.
+
+        Raises:
+            ValueError: levels outside of 0 to 1.
         """
         q = numeric(q, "q")
         if q.ndim != 1 or not np.all((q >= 0) & (q <= 1)):
@@ -128,13 +134,14 @@ class Gaussian:
         return self._to_physical(self._in_coordinates(q))
 
     def interval(self, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Central marginal interval of the normal, cut at the bounds: (low [D], high [D]) in physical units.
+        """Return the central marginal interval of the normal, cut at the bounds: (low [D], high [D]) in physical units.
 
-        It holds at least `level` of the mass inside the bounds, and always `centre`, the value that a fit reports.
-        Where the normal reaches beyond a bound the interval ends there: equal tails inside the bounds would leave out
-        a value that sits on one.  Of a normal whose mean lies outside the bounds it begins at the nearest one.
+        It holds at least `level` of the probability inside the bounds, and always `centre`, the value that a fit
+        reports.  Where the normal extends beyond a bound the interval ends there, since equal tails inside the bounds
+        would exclude a value on a bound.  If the mean is outside of the bounds, the interval begins at the nearest one.
 
-        Raises ValueError unless 0 < level < 1.
+        Raises:
+            ValueError: a level that is not between 0 and 1.
         """
         level = number(level, "level", above=0, below=1)
         half = float(special.ndtri((1 + level) / 2)) * np.sqrt(np.diag(self.cov))
@@ -142,24 +149,24 @@ class Gaussian:
         low, high = self._box()
         from_low, from_high = self.mean < low, self.mean > high
         if np.any(from_low | from_high):
-            rest, most = self._in_coordinates([1 - level, level])
-            ends = np.where(from_low, [low, most], np.where(from_high, [rest, high], ends))
+            lower, upper = self._in_coordinates([1 - level, level])
+            ends = np.where(from_low, [low, upper], np.where(from_high, [lower, high], ends))
         ends = self._to_physical(ends)
         return ends[0], ends[1]
 
     @property
     def centre(self) -> np.ndarray:
-        """[D] the mean in physical units, inside the bounds: of a parameter in log coordinates its median.
+        """[D] the fitted values: the mean in physical units, clipped to the bounds.
 
-        What a fit found.  `physical_mean` is larger where a parameter in log coordinates is not told: 5.9 times for
-        the hinge stiffness of `door_space`'s prior.
+        For a log-scaled parameter this is the median.  `physical_mean` is larger if the data do not constrain such a
+        parameter: 5.9 times for the hinge stiffness of `door_space`'s prior.
         """
         values = self.space.from_search(self.mean) if self.coordinates == "search" else self.mean
         return np.clip(values, self.space.low, self.space.high)
 
     @cached_property
     def physical_mean(self) -> np.ndarray:
-        """[D] marginal means in physical units, over a fixed grid of equal-probability quantiles."""
+        """[D] marginal means in physical units, over a grid of quantiles of equal probability."""
         return self._grid.mean(axis=0)
 
     @cached_property
@@ -168,14 +175,14 @@ class Gaussian:
         return self._grid.std(axis=0)
 
     def marginal(self, names: Iterable[str]) -> Gaussian:
-        """The Gaussian of these parameters alone, in the order given."""
+        """Return the marginal of these parameters, in the given order."""
         names = several(name)(names, "names")
         index = [self.space.index(n) for n in names]
         cov = self.cov[np.ix_(index, index)]
         return Gaussian(self.space.select(names), self.mean[index], cov, self.rule, self.coordinates)
 
     def to_json(self) -> dict[str, Any]:
-        """The content of the JSON file described in the module's text."""
+        """Return the content of the JSON file that the module's docstring describes."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -187,16 +194,16 @@ class Gaussian:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write the JSON file described in the module's text, whole or not at all."""
+        """Write the JSON file that the module's docstring describes, atomically."""
         write_json(Path(path), self.to_json())
 
     @cached_property
     def _grid(self) -> np.ndarray:
-        """[MOMENT_POINTS, D] physical values that each stand for an equal share of a marginal."""
+        """[MOMENT_POINTS, D] physical values, quantiles of equal probability of each marginal."""
         return self.quantiles((np.arange(MOMENT_POINTS) + 0.5) / MOMENT_POINTS)
 
     def _in_coordinates(self, q: Sequence[float] | np.ndarray) -> np.ndarray:
-        """[Q, D] marginal quantiles at levels q [Q] inside the box that draws must lie in, in `coordinates`."""
+        """[Q, D] marginal quantiles at levels q [Q] inside the box of `_box`, in `coordinates`."""
         q = np.asarray(q, dtype=np.float64)
         columns = [
             _truncated_quantiles(q, m, s, a, b)
@@ -205,12 +212,12 @@ class Gaussian:
         return np.stack(columns, axis=-1)
 
     def _draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """[n, D] draws in `coordinates`, bounds ignored."""
+        """[n, D] draws in `coordinates`, without bounds."""
         variances, axes = np.linalg.eigh(self.cov)
         return self.mean + (rng.standard_normal((n, len(self.mean))) * np.sqrt(variances.clip(0))) @ axes.T
 
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Region that draws must lie in, (low [D], high [D]) in `coordinates`; infinite where clipped."""
+        """Bounds (low [D], high [D]) of draws in `coordinates`; infinite where the map clips."""
         if self.coordinates == "physical":
             return self.space.low, self.space.high
         return redraw_box(self.space)
@@ -233,7 +240,7 @@ class Gaussian:
 
 
 def prior(space: Space) -> Gaussian:
-    """The initial Gaussian of a space: one deviation per parameter, uncorrelated, search coordinates."""
+    """Return the prior of a space: uncorrelated, of one deviation per parameter, in search coordinates."""
     return Gaussian(space, space.to_search(space.mean), np.eye(len(space)), rule="prior")
 
 
@@ -270,19 +277,19 @@ def load_gaussian(path: str | Path) -> Gaussian:
 
 
 def space_to_json(space: Space) -> list[dict[str, Any]]:
-    """A space as JSON values: one object per parameter, writes included."""
+    """Return a space as JSON values, one object per parameter with its writes."""
     out: list[dict[str, Any]] = []
     for p in space.parameters:
         entry = asdict(p) | {"scaling": p.scaling.value, "role": p.role.value}
         if p.role is (Role.OTHER if p.writes else role_in_theta(p.name)):
-            del entry["role"]  # as in files of earlier versions
+            del entry["role"]  # it follows from the name; files of earlier versions have no roles
         entry["writes"] = [asdict(w) | {"mode": w.mode.value, "index": list(w.index)} for w in p.writes]
         out.append(entry)
     return out
 
 
 class WriteEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A write of a parameter in a file; older files state no offset and no element."""
+    """A write of a parameter in a file; files of earlier versions have no offset and no element."""
 
     field: str
     index: list[int]
@@ -293,7 +300,7 @@ class WriteEntry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ParameterEntry(msgspec.Struct, forbid_unknown_fields=True):
-    """A parameter in a file; one whose role follows from its name states none."""
+    """A parameter in a file; the role is missing if it follows from the name."""
 
     name: str
     unit: str
@@ -322,13 +329,8 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     space: list[ParameterEntry]
 
 
-def space_from_json(entries: Any) -> Space:
-    """The space that `space_to_json` described; ValueError names the parameter and entry that is wrong."""
-    return space_of(typed(entries, list[ParameterEntry], "space"))
-
-
 def space_of(entries: Iterable[ParameterEntry]) -> Space:
-    """The space of a file's entries."""
+    """Return the space of a file's entries."""
     return Space(tuple(_parameter(entry) for entry in entries))
 
 
@@ -343,16 +345,16 @@ def _parameter(entry: ParameterEntry) -> Parameter:
 
 
 def matrix(name: str, rows: list[Any]) -> np.ndarray:
-    """Rows of a file as an array, where they are of one length."""
+    """Return the rows of a file as an array; ValueError if their lengths differ."""
     if len({len(cast(list[Any], row)) for row in rows if isinstance(row, list)}) > 1:
         raise ValueError(f"{name} must have rows of one length")
     return np.array(rows, dtype=np.float64)
 
 
 def redraw_box(space: Space) -> tuple[np.ndarray, np.ndarray]:
-    """(low [D], high [D]) in search coordinates outside of which a draw is drawn again.
+    """Return bounds (low [D], high [D]) in search coordinates, outside of which a draw is drawn again.
 
-    The bounds where a parameter is scaled linearly, infinite where its logarithmic map clips.
+    They are the parameter's bounds if it is scaled linearly, and infinite if it is log-scaled, since its map clips.
     """
     linear = np.array([p.scaling is Scaling.LINEAR for p in space.parameters])
     low, high = space.to_search(space.low), space.to_search(space.high)
@@ -360,7 +362,7 @@ def redraw_box(space: Space) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A float64 copy of an array of this shape, or ValueError."""
+    """A float64 copy of an array; ValueError for another shape or entries that are not finite."""
     array = numeric(values, f"{name} [{', '.join(map(str, shape))}]").copy()
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
@@ -370,12 +372,12 @@ def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _check_covariance(cov: np.ndarray) -> None:
-    """ValueError unless cov [D, D] is symmetric and positive semi-definite to rounding."""
+    """Raise ValueError unless cov [D, D] is symmetric and positive semi-definite up to rounding."""
     scale = np.sqrt(np.abs(np.diag(cov)))
     tolerance = 1e-6 * np.outer(scale, scale) + 1e-300
     if not np.all(np.abs(cov - cov.T) <= tolerance):
         raise ValueError("cov must be symmetric")
-    # judged as a correlation matrix: variances of parameters in different units differ by decades
+    # Checked as a correlation matrix: variances of parameters in different units differ by decades.
     unit = np.where(scale > 0, scale, 1.0)
     lowest = float(np.linalg.eigvalsh((cov + cov.T) / 2 / np.outer(unit, unit))[0])
     if lowest < -1e-6 * len(cov):
@@ -383,7 +385,7 @@ def _check_covariance(cov: np.ndarray) -> None:
 
 
 def _truncated_quantiles(q: np.ndarray, mean: float, std: float, low: float, high: float) -> np.ndarray:
-    """[Q] quantiles of a normal truncated to [low, high]; a std of 0 is a point."""
+    """[Q] quantiles of a normal truncated to [low, high]; with std 0 all of them are the mean."""
     if std == 0:
         return np.full(q.shape, mean)
     return mean + std * quantiles(q, np.asarray((low - mean) / std), np.asarray((high - mean) / std))

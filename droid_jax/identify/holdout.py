@@ -1,13 +1,15 @@
-"""What a fit is judged on: repeats that it does not see, and the gap to them before and after."""
+"""Held-out data of a fit, and the distance to them before and after the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
+from droid_jax.arguments import check_fields, number
 from droid_jax.cost.cost import Cost
 from droid_jax.cost.errors import ChannelErrors, channel_errors, channel_unit, sample_of
 from droid_jax.cost.observation import Measured
@@ -15,29 +17,51 @@ from droid_jax.cost.residuals import Comparison, make_comparison
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
-LONG = 1.5  # times the beginning that is asked for, from which on a recording is long
-STANDS = 0.01  # share of a command's range, up to which it stands still
-WORTH = 0.1  # share of the noise floor by which the distance before a fit must exceed it, unless a config says else
+WORTH = 0.1  # default of `IdentifyConfig.worth`
 NOISE_UNITS = "noise units"
 Judged = Literal["repeats", "time", "same", "recordings"]
 
 
 @dataclass(frozen=True)
-class HeldoutDistance:
-    """Disagreement with what was held out of one recording, before and after the fit.
+class BeginningConfig:
+    """When only the beginning of a long commanded recording is used, and how much of it.
 
-    channels: what was compared; per-joint numbers are of the leading one (torque, where it is compared).
-    unit: of the distances, that of the channel, or "noise units" where several are compared (see
-    `channels.in_noise_units`).
-    before, after, noise_floor: equation 1 without penalty terms, all compared channels; floor is what a perfect
-    model would leave, estimated from the scatter of all repeats, fitted and held out, about their mean.
-    closed: share of the way from before to noise_floor; None where before does not exceed it by the share
-    `worth` of it.
-    Floors and closed are None where there is one repeat only.
-    per_joint_*: [J] root mean square of the smoothed difference, in per_joint_unit.
-    judged: on what: "repeats" that were held out, the last part in "time" of a log, the "same" one repeat that was
-    fitted, or whole "recordings" that the fit did not see.
-    errors: by channel of all that were measured, in physical units.
+    long: factor on the requested seconds above which a recording is long; a design choice.
+    covered: share of its range that every command must have covered at the end of the beginning; a design choice.
+    still: share of its range by which a command may have changed while the robot still stands; a design choice.
+    """
+
+    long: float = 1.5
+    covered: float = 0.5
+    still: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            long=partial(number, least=1),
+            covered=partial(number, least=0, most=1),
+            still=partial(number, least=0, most=1),
+        )
+
+
+DEFAULT_BEGINNING = BeginningConfig()
+
+
+@dataclass(frozen=True)
+class HeldoutDistance:
+    """Distance to the held-out part of one recording, before and after the fit.
+
+    before, after: equation 1 without penalty terms, over all compared channels.
+    noise_floor: the distance of a perfect model, estimated from the scatter of all repeats, fitted and held out, about
+      their mean; None for one repeat.
+    closed: share of the difference between `before` and `noise_floor` that the fit removed; None for one repeat, or if
+      that difference is less than the share `worth` of the floor.
+    per_joint_*: [J] root mean square of the smoothed residual of the leading channel, in `per_joint_unit`.
+    judged: the held-out data: "repeats", the last part in "time" of a log, the "same" repeat that was fitted, or whole
+      "recordings".
+    channels: that were compared; the leading one is torque where it is compared.
+    unit: of the distances, that of the channel, or "noise units" for several channels (`channels.in_noise_units`).
+    errors: of all measured channels, in physical units.
     """
 
     before: float
@@ -55,9 +79,12 @@ class HeldoutDistance:
 
 
 def split_repeats(recording: Recording, share: float) -> tuple[Recording, Recording, tuple[int, ...]]:
-    """Fitted and held-out repeats (the last ones), and the latter's indices.
+    """Return a recording's repeats for the fit, the held-out ones (the last), and the numbers of the latter.
 
-    Of one repeat without commands the last part in time is held out; with commands, one serves as both.
+    From one repeat without commands, the last part in time is held out, at least a third.  One repeat with commands is
+    used for both.
+
+    share: of the repeats that is held out, at least one of them.
     """
     count = recording.repeats
     if count == 1 and not recording.command.size:
@@ -72,7 +99,7 @@ def split_repeats(recording: Recording, share: float) -> tuple[Recording, Record
 
 
 def judged_on(recording: Recording, held: Recording) -> Judged:
-    """What `split` held out of a recording."""
+    """Return what `split_repeats` held out of a recording."""
     if held is recording:
         return "same"
     return "time" if recording.repeats == 1 else "repeats"
@@ -85,22 +112,28 @@ def heldout_distances(
     before: np.ndarray,
     after: np.ndarray,
     worth: float = WORTH,
-    apart: bool = False,
+    whole_recordings: bool = False,
 ) -> list[HeldoutDistance]:
-    """The distance to what was held out of each recording, of which `cost` is, at two parameter vectors [F].
+    """Return the distance to the held-out part of each recording, at two parameter vectors.
 
-    worth: share of the noise floor by which the start must exceed it, else there was nothing to close.
-    apart: the recordings are whole ones that no fit saw.
+    Args:
+        cost: of the held-out parts.
+        recordings: with all their repeats.
+        held: the held-out parts.
+        before: [F] initial values.
+        after: [F] fitted values.
+        worth: share of the noise floor by which the distance before the fit must exceed it for `closed` to be defined.
+        whole_recordings: the held-out data are whole recordings that the fit did not use.
     """
     penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
     smoothed, rollouts = cost.smoothed(np.stack([before, after])), cost.rollouts(np.stack([before, after]))
     out: list[HeldoutDistance] = []
-    for i, (one, recording, own) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
-        seen = one.leading.noise.count > 0
-        off = np.where(seen, smoothed[i] - one.leading.noise.mean, 0.0)
-        rms = np.sqrt(np.sum(off**2, axis=1) / np.maximum(seen.sum(axis=0), 1))
-        alike = cost.from_one_start(i, recording)  # as the held-out repeats that `cost` compares
-        everything = make_comparison(cost.scene, alike, one.clock, one.config) if recording.repeats > 1 else None
+    for i, (one, recording, heldout) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
+        measured = one.leading.noise.count > 0
+        residual = np.where(measured, smoothed[i] - one.leading.noise.mean, 0.0)
+        rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(measured.sum(axis=0), 1))
+        from_start = cost.from_one_start(i, recording)  # from the start of the repeats that `cost` compares
+        everything = make_comparison(cost.scene, from_start, one.clock, one.config) if recording.repeats > 1 else None
         floor = None if everything is None else _floor(everything)
         pair = sample_of(rollouts[i], 0), sample_of(rollouts[i], 1)
         first, last = penalty_free[0, i], penalty_free[1, i]
@@ -113,37 +146,37 @@ def heldout_distances(
                 per_joint_before=tuple(rms[0].tolist()),
                 per_joint_after=tuple(rms[1].tolist()),
                 per_joint_noise_floor=None if everything is None else _smooth_floor(everything, one.repeats),
-                judged="recordings" if apart else judged_on(recording, own),
+                judged="recordings" if whole_recordings else judged_on(recording, heldout),
                 channels=tuple(c.name for c in one.channels),
                 unit=distance_unit(cost.scene, one),
                 per_joint_unit=unit_of(cost.scene, one.leading),
-                errors=channel_errors(cost.scene, cost.from_one_start(i, own), one.clock, *pair),
+                errors=channel_errors(cost.scene, cost.from_one_start(i, heldout), one.clock, *pair),
             )
         )
     return out
 
 
 def unit_of(scene: Scene, channel: Measured) -> str:
-    """Unit of a compared channel's columns in this scene."""
+    """Return the unit of a compared channel's columns in this scene."""
     rows: list[int] = channel.columns.tolist()
     joints = () if channel.name == "object_angle" else [scene.joints[c] for c in rows]
     return channel_unit(scene, channel.name, joints, channel.unit)
 
 
 def distance_unit(scene: Scene, comparison: Comparison) -> str:
-    """Unit of equation 1: the compared channel's; of several, which enter by their noise, noise units."""
+    """Return the unit of equation 1: the compared channel's, or noise units for several channels."""
     return unit_of(scene, comparison.channels[0]) if len(comparison.channels) == 1 else NOISE_UNITS
 
 
 def _closed(before: float, after: float, floor: float | None, worth: float = WORTH) -> float | None:
-    """Share of the way from before to the floor that was gone; None where there was hardly any."""
+    """Share of the difference to the floor that the fit removed; None if the difference was below `worth` of it."""
     if floor is None or before - floor <= worth * floor:
         return None
     return 1 - (after - floor) / (before - floor)
 
 
 def _floor(everything: Comparison) -> float | None:
-    """Equation 1 of a perfect model, from the scatter of all repeats; None where no instant was measured twice."""
+    """Equation 1 of a perfect model, from the scatter of all repeats; None if no instant was measured twice."""
     total = 0.0
     for channel in everything.channels:
         scatter = _scatter(channel.values, channel.mask)
@@ -154,13 +187,13 @@ def _floor(everything: Comparison) -> float | None:
 
 
 def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
-    """The repeats' [N, T, C] distance to their mean, corrected for the mean's own noise, where two or more measured."""
+    """Distance of the repeats [N, T, C] to their mean, corrected for the mean's noise, at instants measured twice."""
     count = mask.sum(axis=0)  # [T, C]
     filled = np.where(mask, values, 0.0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
-    seen = mask & (count > 1)
-    error = np.where(seen, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
-    rows = np.any(seen, axis=-1)  # [N, T]
+    measured_twice = mask & (count > 1)
+    error = np.where(measured_twice, (filled - mean) / np.sqrt(1 - 1 / np.maximum(count, 2)), 0.0)
+    rows = np.any(measured_twice, axis=-1)  # [N, T]
     repeats = np.any(rows, axis=1)
     if not repeats.any():
         return None
@@ -169,23 +202,25 @@ def _scatter(values: np.ndarray, mask: np.ndarray) -> float | None:
 
 
 def _smooth_floor(everything: Comparison, held: int) -> tuple[float, ...]:
-    """[J] N m, what the noise of the mean of `held` repeats leaves of a smoothed difference."""
+    """[J] N m, root mean square of a smoothed residual that consists of the noise of the mean of `held` repeats."""
     noise = everything.leading.noise
     squares = ((noise.repeats - noise.mean) ** 2).sum(axis=0)
     variance = squares.sum(axis=0) / (noise.count - 1).sum(axis=0)
     return tuple(np.sqrt(variance / held).tolist())
 
 
-def beginning(recording: Recording, seconds: float) -> Recording:
-    """A long commanded recording's first seconds, and more until its commands have covered half of their range.
+def beginning(recording: Recording, seconds: float, config: BeginningConfig = DEFAULT_BEGINNING) -> Recording:
+    """Return the beginning of a long commanded recording; a short one, or one without commands, is unchanged.
 
-    The seconds count from where a command begins to change: a robot that stands still tells little.
+    It is longer than `seconds` if the commands cover their range later.
+
+    seconds: counted from where a command begins to change, since a robot that stands is hardly informative.
     """
     begin, end = recording.span
-    if not recording.command.size or end - begin <= LONG * seconds:
+    if not recording.command.size or end - begin <= config.long * seconds:
         return recording
-    reach = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
-    moved = recording.time[int(np.argmax(np.all(reach >= 0.5 * reach[-1], axis=1)))]
-    starts = recording.time[int(np.argmax(np.any(reach > STANDS * reach[-1], axis=1)))]
-    until = max(float(starts) + seconds, float(moved))
-    return recording if until > begin + (end - begin) / LONG else recording.window(begin, until)
+    extent = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
+    covered = recording.time[int(np.argmax(np.all(extent >= config.covered * extent[-1], axis=1)))]
+    starts = recording.time[int(np.argmax(np.any(extent > config.still * extent[-1], axis=1)))]
+    until = max(float(starts) + seconds, float(covered))
+    return recording if until > begin + (end - begin) / config.long else recording.window(begin, until)

@@ -1,22 +1,22 @@
-"""From a refined fit to a calibrated Gaussian, and what the demonstration tells about each parameter.
+"""The calibrated Gaussian of a refined fit, and which parameters the data constrain.
 
-Rule of the width.  Gauss-Newton around the best gives the covariance H^-1 with nuisances
-marginalised.  It believes that the residuals are noise which is independent from joint to joint and
-stationary in time.  Two sandwiches H^-1 S H^-1 (Huber 1967) ask the data what the scores J^T r really do:
+Rule of the width.  Gauss-Newton around the best values gives the covariance H^-1, with nuisances marginalised.  It
+assumes that the residuals are noise, independent between joints and stationary in time.  Two sandwich estimates
+H^-1 S H^-1 (Huber 1967) measure the covariance S of the scores J^T r instead:
 
-* between repeats: every repeat has its own errors of pose and grasp, which stay for a whole opening and
-  pull at all joints together.  S is the scatter of the repeats' scores.  Ten repeats say little about one
-  parameter, so each parameter's ratio to H^-1 is drawn towards the ratio over all of them;
-* within the residual: what the model leaves over is more than noise, and correlated.  S is the
-  scatter of the scores of contiguous blocks of time (Kuensch 1989), per column.
+* between repeats: each repeat has its own errors of pose and grasp, which last for the whole motion and act on all
+  joints.  S is the scatter of the repeats' scores.  Ten repeats say little about one parameter, so the ratio of each
+  parameter's variance to H^-1 is shrunk towards the ratio over all parameters;
+* within the residual: the model's error is larger than the noise, and correlated.  S is the scatter of the scores of
+  contiguous blocks of time (Kuensch 1989), of each column.
 
-Each deviation becomes the largest of the three; correlations stay those of H^-1.  So the data's information and
-the prior's are widened alike.  But what a poor model leaves over makes its data less certain, and not what was stated
-before them; and the refinement may have used a wider prior, so as not to be pulled by it.  The Gaussian that is
-handed on holds the data's information as it was widened, and the stated prior as it was stated.
+Each deviation becomes the largest of the three; the correlations are those of H^-1.  This widens the prior's part as
+well as the data's.  But a poor model only makes the data less informative, not the prior; and the refinement may have
+used a wider prior than the stated one.  So the result combines the widened information of the data with the stated
+prior (`with_stated_prior`).
 
-None of this sees the simulation's own time step, which moves every fit the same way.  What it does to the fitted values
-is measured by a finer replay and added as one direction (`moved_by_step`).
+The error of the time step, which moves all fits in the same direction, is not included in these estimates.  It is
+measured with a finer replay and added as a covariance of rank one (`moved_by_step`).
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from droid_jax.identify.gaussian import Gaussian
 from droid_jax.identify.levenberg_marquardt import curvature
 from droid_jax.identify.multistart import Refined
 
-STATED = 1.0  # search units: the deviation of a parameter's stated prior
+STATED_PRIOR = 1.0  # deviation of a parameter's stated prior, search units
 
 
 @dataclass(frozen=True)
 class IdentifiabilityConfig:
-    """What decides the calibrated width, and when a parameter counts as identifiable.
+    """Settings of the calibrated width, and of when a parameter counts as identifiable.
 
-    identifiable: posterior deviation over prior deviation, below which the data constrain a parameter.
-    pooling: degrees of freedom with which the widening over all parameters counts in each one's own; ten repeats alone
-      say little about one parameter.
+    identifiable: posterior deviation over prior deviation, below which a parameter is identifiable.
+    pooling: degrees of freedom of the widening over all parameters, which each parameter's own widening is shrunk
+      towards; ten repeats alone say little about one parameter.
     block: s, length of the contiguous blocks of time over which the residual's scores are summed (Kuensch 1989).
-    partner: absolute correlation from which two parameters are called partners.
+    partner: absolute correlation above which two parameters are listed as partners.
     """
 
     identifiable: float = 0.25
@@ -68,9 +68,11 @@ DEFAULT_IDENTIFIABILITY = IdentifiabilityConfig()
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data tell about one parameter: identifiable or not, why, and who it trades with.
+    """Whether the data constrain one parameter, and how it is correlated with others.
 
-    moved: deviations of its stated prior by which the fit moved it, search units; NaN where that was not judged.
+    name: of the parameter.  identifiable: whether `shrinkage` is below the threshold.
+    shrinkage: posterior over prior deviation.  partners: names of strongly correlated parameters, and the correlations.
+    reason: a clause for reports.  moved: search units, distance of the fit from the prior mean; NaN if not known.
     """
 
     name: str
@@ -84,7 +86,13 @@ class Identifiability:
 def posterior(
     refined: Refined, comparisons: Sequence[Comparison], config: IdentifiabilityConfig = DEFAULT_IDENTIFIABILITY
 ) -> Gaussian:
-    """The Gaussian to hand on, in search coordinates over the refined space: `posterior_of` with the stated prior."""
+    """Return the result of an identification: `posterior_of` with the stated prior, in search coordinates.
+
+    Args:
+        refined: the fit.
+        comparisons: of the recordings that were refined on.
+        config: settings of the width.
+    """
     return with_stated_prior(posterior_of(refined, comparisons, config), refined)
 
 
@@ -95,10 +103,15 @@ def posterior_of(
     *,
     misfit: bool = True,
 ) -> Gaussian:
-    """What the recordings that were refined on tell by themselves, but for the refinement's wide prior.
+    """Return the posterior of the fitted recordings with the refinement's wide prior, in search coordinates.
 
-    For questions to the data alone, as whether a coefficient may be zero.
-    misfit: whether what the model leaves over beyond noise widens it too; without it the model is taken to be right.
+    It serves tests that should use the data only, such as whether a coefficient may be zero.
+
+    Args:
+        refined: the fit.
+        comparisons: of the recordings that were refined on.
+        config: settings of the width.
+        misfit: whether the model's error widens it too.  If not, the model is taken to be right.
     """
     channels = [c for comparison in comparisons for c in comparison.channels]
     shapes = [(len(c.columns), c.noise.mean.shape[0]) for c in channels]
@@ -108,33 +121,36 @@ def posterior_of(
 
 
 def with_stated_prior(gaussian: Gaussian, refined: Refined) -> Gaussian:
-    """A calibrated Gaussian with the stated prior in place of the refinement's, which was widened with the data.
+    """Return a calibrated Gaussian with the stated prior instead of the refinement's prior.
 
-    With D the widening of every deviation, C = D H^-1 D and H = J^T J + P: C^-1 - D^-1 P D^-1 + P_stated.
-    Its mean stays, lest a value that is far from the prior and well told be pulled: between told and untold (a
-    deviation of about one prior) the width is up to a third too small for that.
+    With D the widening of the deviations, C = D H^-1 D and H = J^T J + P, the precision is
+    C^-1 - D^-1 P D^-1 + P_stated.  The mean is not changed, so that a value that is far from its prior mean and well
+    constrained does not move.  For posterior deviations of about one prior deviation the width is therefore up to a
+    third too small.
     """
     widened = np.diag(gaussian.cov) / np.diag(np.linalg.inv(refined.hessian))  # variances
-    stated = np.minimum(refined.prior, STATED) ** -2.0
+    stated = np.minimum(refined.prior, STATED_PRIOR) ** -2.0
     precision = np.linalg.inv(gaussian.cov) - np.diag(refined.prior**-2.0 / widened) + np.diag(stated)
     cov = np.linalg.inv(precision)
     return replace(gaussian, cov=0.5 * (cov + cov.T))
 
 
-def step_shift(refined: Refined, off: np.ndarray) -> np.ndarray:
-    """[D] how far a difference `off` [M] of the simulation would move the fit, search units; zero at a bound.
+def step_shift(refined: Refined, change: np.ndarray) -> np.ndarray:
+    """Return the shift [D] of the fit, search units, if the simulation changes by `change`; zero at a bound.
 
-    off: in the refinement's own units, of its first M residuals.
+    change: [M] of the refinement's first M residuals, in noise units.
     """
-    jacobian = refined.jacobian[: len(off)]
-    shift = np.linalg.solve(curvature(jacobian, refined.prior), jacobian.T @ off)
+    jacobian = refined.jacobian[: len(change)]
+    shift = np.linalg.solve(curvature(jacobian, refined.prior), jacobian.T @ change)
     return np.where(refined.free, -shift, 0.0)
 
 
 def moved_by_step(gaussian: Gaussian, shift: np.ndarray) -> Gaussian:
-    """A Gaussian that is as uncertain as its time step makes it; shift: [D] of `step_shift`.
+    """Return a Gaussian whose covariance includes the error of the time step, shift shift^T.
 
-    An arm of three joints that was fitted at 5 ms has its dampings 1 % too low, three to four of its own deviations.
+    An arm of three joints that was fitted at 5 ms has its dampings 1 % too low, three to four of their deviations.
+
+    shift: [D] from `step_shift`.
     """
     if not shift.any():
         return gaussian
@@ -149,23 +165,25 @@ def calibrated(
     block_ids: np.ndarray | None,
     pooling: float = DEFAULT_IDENTIFIABILITY.pooling,
 ) -> Gaussian:
-    """The rule of the width on plain arrays.
+    """Return the calibrated Gaussian, by the rule in the module's docstring, with the refinement's prior.
 
-    deviations: per recording [N, M_i] whitened deviations of its repeats from their mean (see
-      `Comparison.deviations`); block_ids: [M] integer block of each residual (see `time_blocks`), or None: what the
-      model leaves over widens nothing; pooling: see `IdentifiabilityConfig`.
+    Args:
+        refined: the fit.
+        deviations: for each recording, whitened deviations [N, M_i] of its repeats (`Comparison.deviations`).
+        block_ids: [M] number of the block of each residual (`time_blocks`); None leaves out the scatter of blocks.
+        pooling: see `IdentifiabilityConfig`.
     """
-    plain = np.linalg.inv(refined.hessian)
-    variance = np.diag(plain)
-    repeats = variance * np.maximum(1.0, _repeat_ratio(refined, plain, deviations, pooling))
-    blocks = variance if block_ids is None else np.diag(_sandwich(refined, plain, block_ids))
+    inverse = np.linalg.inv(refined.hessian)
+    variance = np.diag(inverse)
+    repeats = variance * np.maximum(1.0, _repeat_ratio(refined, inverse, deviations, pooling))
+    blocks = variance if block_ids is None else np.diag(_sandwich(refined, inverse, block_ids))
     factor = np.sqrt(np.maximum(repeats, blocks) / variance)
-    cov = plain * np.outer(factor, factor)
+    cov = inverse * np.outer(factor, factor)
     main = ~refined.space.nuisance
-    left = "" if block_ids is None else " and to the block scores of the residuals"
+    by_blocks = "" if block_ids is None else " and to the block scores of the residuals"
     rule = (
         "Gauss-Newton around the best, nuisances marginalised, deviations widened to the scatter between repeats"
-        f"{left} (x{np.median(factor[main]):.2f} in the median)"
+        f"{by_blocks} (x{np.median(factor[main]):.2f} in the median)"
     )
     return Gaussian(refined.space, refined.x, 0.5 * (cov + cov.T), rule, "search")
 
@@ -173,29 +191,30 @@ def calibrated(
 def _repeat_ratio(
     refined: Refined, inverse: np.ndarray, deviations: Sequence[np.ndarray], pooling: float
 ) -> np.ndarray:
-    """[D] variance that the repeats' scatter gives each parameter, over the one that whitened noise would give.
+    """[D] variance of each parameter by the scatter of the repeats' scores, over that of whitened noise.
 
-    Both hold the prior's share, so that what the data do not see stays at ratio 1.
+    Both include the prior's part, so that the ratio of an unconstrained parameter is 1.
     """
     prior = np.diag(refined.prior**-2)
-    scatter, freedom, start = np.zeros_like(inverse), 0, 0
+    scatter, degrees_of_freedom, start = np.zeros_like(inverse), 0, 0
     for deviation in deviations:
         count, size = deviation.shape
         part = refined.jacobian[start : start + size]
         start += size
-        if count < 2:  # one repeat says nothing about scatter
+        if count < 2:  # one repeat has no scatter
             scatter += part.T @ part
             continue
         scores = deviation @ part
         scatter += scores.T @ scores / (count * (count - 1))
-        freedom += count - 1
-    seen = refined.jacobian.T @ refined.jacobian
-    pooled = np.trace(inverse @ scatter) / max(np.trace(inverse @ seen), 1e-12)
-    shared = freedom * scatter + pooling * pooled * seen
-    return np.diag(inverse @ (shared / (freedom + pooling) + prior) @ inverse) / np.diag(inverse)
+        degrees_of_freedom += count - 1
+    information = refined.jacobian.T @ refined.jacobian
+    pooled = np.trace(inverse @ scatter) / max(np.trace(inverse @ information), 1e-12)
+    shrunk = (degrees_of_freedom * scatter + pooling * pooled * information) / (degrees_of_freedom + pooling)
+    return np.diag(inverse @ (shrunk + prior) @ inverse) / np.diag(inverse)
 
 
 def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> np.ndarray:
+    """[D, D] covariance from the scatter of the scores of blocks, with the prior's part."""
     scores = np.zeros((int(block_ids.max()) + 1, refined.jacobian.shape[1]))
     np.add.at(scores, block_ids, refined.jacobian * refined.residual[:, None])
     prior = np.diag(refined.prior**-2)
@@ -205,24 +224,27 @@ def _sandwich(refined: Refined, inverse: np.ndarray, block_ids: np.ndarray) -> n
 def time_blocks(
     shapes: Sequence[tuple[int, int]], seconds: Sequence[float], block: float = DEFAULT_IDENTIFIABILITY.block
 ) -> np.ndarray:
-    """[M] block of each whitened residual: per recording and column, contiguous stretches of `block` s.
+    """Return the number [M] of the block of each whitened residual, contiguous stretches of about `block` s.
 
-    shapes: (columns C, coarse samples K) of each compared channel, in the order of the residuals
-    (column by column); seconds: its duration.
+    Args:
+        shapes: (columns C, coarse samples K) of each compared channel, in the order of the residuals, which is column
+            by column.
+        seconds: duration of each channel.
+        block: s, length of a block.
     """
     ids: list[np.ndarray] = []
     start = 0
     for (columns, samples), duration in zip(shapes, seconds, strict=True):
         per_column = max(1, round(duration / block))
-        within = np.minimum((np.arange(samples) * per_column) // samples, per_column - 1)
+        numbers = np.minimum((np.arange(samples) * per_column) // samples, per_column - 1)
         for _ in range(columns):
-            ids.append(start + within)
+            ids.append(start + numbers)
             start += per_column
     return np.concatenate(ids)
 
 
 def not_judged(gaussian: Gaussian) -> tuple[Identifiability, ...]:
-    """For a search's own covariance, which is no posterior: nothing is called identifiable from it."""
+    """Return verdicts for the covariance of a search, which is no posterior: no parameter is called identifiable."""
     reason = "not judged: the search's covariance depends on when it stopped"
     return tuple(Identifiability(name, False, 1.0, (), reason) for name in gaussian.space.names)
 
@@ -230,27 +252,32 @@ def not_judged(gaussian: Gaussian) -> tuple[Identifiability, ...]:
 def identifiability(
     gaussian: Gaussian, prior: np.ndarray, config: IdentifiabilityConfig = DEFAULT_IDENTIFIABILITY
 ) -> tuple[Identifiability, ...]:
-    """What the demonstration tells about each parameter of a calibrated Gaussian.
+    """Return for each parameter of a calibrated Gaussian whether the data constrain it.
 
-    It is judged against the stated prior, or the refinement's where that is narrower.
-    prior: [D] deviations of the refinement's prior, search units.
+    The posterior deviation is compared with the stated prior, or with the refinement's prior if that is narrower.
+
+    Args:
+        gaussian: calibrated, over D parameters.
+        prior: [D] deviations of the refinement's prior, search units.
+        config: thresholds.
     """
     deviation = np.sqrt(np.diag(gaussian.cov))
     correlation = gaussian.cov / np.outer(deviation, deviation)
     space = gaussian.space
-    away = gaussian.mean if gaussian.coordinates == "search" else space.to_search(gaussian.mean)
+    moved = gaussian.mean if gaussian.coordinates == "search" else space.to_search(gaussian.mean)
     out: list[Identifiability] = []
     for i, name in enumerate(space.names):
-        shrinkage = float(deviation[i] / min(prior[i], STATED))
-        nearest: list[int] = np.argsort(-np.abs(correlation[i])).tolist()
-        others = [(space.names[j], float(correlation[i, j])) for j in nearest if j != i]
+        shrinkage = float(deviation[i] / min(prior[i], STATED_PRIOR))
+        strongest: list[int] = np.argsort(-np.abs(correlation[i])).tolist()
+        others = [(space.names[j], float(correlation[i, j])) for j in strongest if j != i]
         partners = tuple((n, c) for n, c in others if abs(c) > config.partner)[:3]
-        known = shrinkage < config.identifiable
-        out.append(Identifiability(name, known, shrinkage, partners, _reason(known, shrinkage), float(away[i])))
+        is_identifiable = shrinkage < config.identifiable
+        reason = _reason(is_identifiable, shrinkage)
+        out.append(Identifiability(name, is_identifiable, shrinkage, partners, reason, float(moved[i])))
     return tuple(out)
 
 
-def _reason(known: bool, shrinkage: float) -> str:
-    if known:
+def _reason(is_identifiable: bool, shrinkage: float) -> str:
+    if is_identifiable:
         return f"the data narrow the prior to {shrinkage:.0%}"
-    return f"the data leave {f'{shrinkage:.0%}' if shrinkage < 1 else 'all'} of the prior's width"
+    return f"the data narrow the prior only to {shrinkage:.0%}" if shrinkage < 1 else "the data do not narrow the prior"

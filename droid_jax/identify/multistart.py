@@ -1,17 +1,17 @@
 """Batched Gauss-Newton (Levenberg-Marquardt) on whitened residuals, from several starts at once.
 
-Works in search coordinates x. The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 / 2, a negative log
-posterior, with a prior of deviation w: one unit for nuisances (their own prior), `main_prior` units
-for the parameters of interest, so that what the data do not tell stays put instead of drifting.
+The coordinates are search coordinates x.  The objective is |r(x)|^2 / 2 + |(x - x0) / w|^2 / 2, a negative log
+posterior with prior deviations w.  They are one unit for nuisances (their stated prior), and `main_prior` units for the
+parameters of interest, so that parameters that the data do not constrain do not drift.
 
-An iteration is `levenberg_marquardt`'s.  What is here decides which starts go on, when to stop, and how to leave a
-basin that is none of the best: hypotheses, initial means, and CMA-ES around where the iterations stood still.
+`levenberg_marquardt` does an iteration.  This module prunes the starts, stops the iterations, and leaves local minima
+in three ways: hypotheses, a reset to initial means, and CMA-ES around the point where the iterations ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -33,40 +33,43 @@ from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
 
-AT_BOUND = 1e-4  # search units: no further from it a parameter counts as stuck there
+AT_BOUND = 1e-4  # search units; a parameter that is no further from a bound is not free
 
 
 @dataclass(frozen=True)
 class RefineConfig(LevenbergMarquardtConfig):
-    """Settings of the refinement, beside those of an iteration.
+    """Settings of the refinement, in addition to those of an iteration.
 
-    iterations: Jacobians at most.
-    tolerance: stop when an iteration lowers the objective (a log likelihood) by less than this,
-    excess_tolerance: or by less than this share of what it is above that of noise alone: a model that misses something
-      may be far from any fit.
-    patience: iterations in a row that do not pay before it stops; after one that found nothing slopes are taken over
-      another width.
-    coarse_tolerance: while starts and hypotheses are sorted out, already when it lowers it by less than this share.
-    target_objective: an objective to reach: stop where it is further off than
-    give_up: iterations like the last.
-    pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective go on (the last
-      number holds from there on).
-    same_basin: of two starts whose replays differ by less than this share of what the better one leaves beyond noise,
-      only that one goes on: they would end at the same values.
-    misfit_threshold: hypotheses are tried where the residuals' mean square stays above this.
-    hold_iterations: iterations for which the values of a hypothesis are held while all else settles.
-    followed: hypotheses that go on once all else has settled a little, the best ones.
-    basin_hops: searches at most for a better basin around where the iterations stood still; with none of them nothing
-      is put back to its initial mean either.
-    basin_hop_generations, basin_hop_population: of each.
-    basin_hop_sigma: initial step of each, posterior deviations.
-    basin_hop_longest: largest component of that step, search units: what the data do not tell is not searched far.
-    basin_hop_tolerance: a hop that lowers the objective by less than this ends the refinement,
-    basin_hop_excess_tolerance: or by less than this share of what it is above that of noise alone.
-    basin_hop_misfit: residuals' mean square above which there is neither a hop nor anything put back: a model that
-      misses something is no small step away from a fit.
-    reset_distance: search units; a parameter of interest that strayed further from its initial mean is put back once,
-    reset_deviation: where its posterior deviation is above this, search units.
+    The excess of the objective is its part above that of noise alone, half a unit for each residual.
+
+    iterations: largest number of iterations, each with one batch of differences.
+    tolerance: an iteration that lowers the objective (a negative log likelihood) by less than this has failed.
+    excess_tolerance: the same as a share of the excess; a model that lacks an effect may be far from any fit.
+    patience: failed iterations in a row after which the refinement stops; after a failed one the differences are wider.
+    coarse_tolerance: share of the objective below which an iteration has failed while starts and hypotheses are
+      compared.
+    target_objective: objective to reach.  The refinement stops if it is further off than `give_up` times the decrease
+      by the last iteration.
+    give_up: number of iterations, see `target_objective`.
+    pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective continue; the last
+      entry applies to all later iterations.
+    same_basin: share of the excess.  Of two starts whose replays differ by less, only the better one continues.
+    misfit_threshold: mean square of the residuals above which hypotheses are tried.
+    hold_iterations: iterations in which the values of a hypothesis are fixed while the others are fitted.
+    followed: number of hypotheses, the best ones, that continue after the first iteration.
+    basin_hops: largest number of searches for a better basin around the point where the iterations ended.  With 0, no
+      parameter is reset to its initial mean either.
+    basin_hop_generations, basin_hop_population: of each search.
+    basin_hop_sigma: initial step of each search, posterior deviations.
+    basin_hop_longest: largest component of that step, search units, which limits directions that the data do not
+      constrain.
+    basin_hop_tolerance: a search that lowers the objective by less than this ends the refinement.
+    basin_hop_excess_tolerance: the same as a share of the excess.
+    basin_hop_misfit: mean square of the residuals above which there is neither a search nor a reset: a model that lacks
+      an effect has no fit nearby.
+    reset_distance: search units.  A parameter of interest that is further from its initial mean is reset to it once, if
+      its posterior deviation is above `reset_deviation`.
+    reset_deviation: search units, see `reset_distance`.
     """
 
     iterations: int = 30
@@ -119,15 +122,42 @@ class RefineConfig(LevenbergMarquardtConfig):
         )
 
 
+@dataclass(frozen=True)
+class RefineInCConfig:
+    """Settings that replace those of `RefineConfig` if plain C MuJoCo does the replays.
+
+    In C there are no blocks of rows to fill, so fewer candidate steps are cheaper.  There are no contact pairs, whose
+    sticking and slipping makes small basins, so no searches for better basins are needed.  In double precision one pass
+    over the posterior's axes gives the final Jacobian.
+
+    dampings, lengths, patience, basin_hops, spreads: see `RefineConfig`.
+    """
+
+    dampings: tuple[float, ...] = (0.1, 1.0, 10.0, 1e3)
+    lengths: tuple[float, ...] = (1.0,)
+    patience: int = 2
+    basin_hops: int = 0
+    spreads: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self.applied(RefineConfig())).items():  # the checks are those of RefineConfig
+            if hasattr(self, name):
+                arguments.set_field(self, name, value)
+
+    def applied(self, config: RefineConfig) -> RefineConfig:
+        """Return `config` with these settings."""
+        return replace(config, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Where the refinement ended.
+    """Result of the refinement, of the best start.
 
-    space; x [D] search coordinates and best [D] physical values of the best start;
-    objective: |r|^2 / 2 plus the prior's part; residual [M] and jacobian [M, D] there;
-    prior [D] deviations, search units; starts: objective each start ended at; evaluations: replays;
-    iterations; converged: it ended before its iterations ran out, since they no longer paid; not where it was given
-    up because `target_objective` was out of reach.
+    space: meaning of the D entries.  x: [D] search coordinates.  best: [D] the same as physical values.
+    objective: |r|^2 / 2 plus the prior's part.  residual: [M].  jacobian: [M, D], by search coordinates.
+    prior: [D] deviations, search units.  starts: [S] final objective of each start.  evaluations: replays.
+    iterations: done.  converged: it stopped by its tolerances, neither at the largest number of iterations nor because
+      `target_objective` was out of reach.
     """
 
     space: Space
@@ -144,7 +174,7 @@ class Refined:
 
     @property
     def free(self) -> np.ndarray:
-        """[D] bool, parameters that are not at a bound."""
+        """[D] bool, parameters that are not on a bound."""
         space = self.space
         return (self.x > space.to_search(space.low) + AT_BOUND) & (self.x < space.to_search(space.high) - AT_BOUND)
 
@@ -156,7 +186,7 @@ class Refined:
 
 @dataclass(frozen=True)
 class RefineProgress:
-    """Reported after every iteration: its number, of how many, and the best objective per residual."""
+    """State after an iteration: its number, the largest number, and twice the best objective over M residuals."""
 
     iteration: int
     iterations: int
@@ -173,47 +203,57 @@ def refine(
     hypotheses: Hypotheses = (),
     progress: Callable[[RefineProgress], None] | None = None,
 ) -> Refined:
-    """Refine one or several starts [D] or [S, D] (physical values).
+    """Refine one or several starts to a local minimum of the objective.
 
-    residuals: [P, D] physical values -> [P, M] whitened residuals (rows are independent).
-    first: the same for a part of the data that is cheaper to replay; starts and hypotheses are sorted
-      out there, and only the best goes on to all of it.
-    hypotheses: assignments {name: value} that may lie in another basin (a finger that slips, say),
-      each tried once from where the starts converged, if that leaves doubt.
-    Raises NotReplayed where no start gives finite residuals; others that do not are left out.
+    Args:
+        residuals: [P, D] physical values -> [P, M] whitened residuals; rows are independent.
+        space: meaning of the D entries.
+        starts: [D] or [S, D] physical values.
+        config: settings; None for the defaults.
+        first: the residuals of a part of the data that is cheaper to replay.  Starts and hypotheses are compared on it,
+            and only the best one continues on all data.
+        hypotheses: assignments {name: value} that may be in another basin, such as a finger that slips.  Each is tried
+            once from the best start, if the mean square of its residuals is above `misfit_threshold`.
+        progress: called after every iteration.
+
+    Returns:
+        The best start's values, with residuals and Jacobian.
+
+    Raises:
+        NotReplayed: no start has finite residuals.  Single starts that blow up are dropped.
     """
     config = config or RefineConfig()
-    rough = _Descent(residuals if first is None else first, space, config, progress)
-    begun, slopes = rough.start_with_slopes(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    coarse = _Descent(residuals if first is None else first, space, config, progress)
+    begun, jacobian = coarse.start_with_slopes(coarse.inside(space.to_search(space.check(np.atleast_2d(starts)))))
     ended, alive = begun.objective, np.isfinite(begun.objective)
     if not alive.any():
         raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance, slopes[alive])
+    state, ended[alive] = coarse.descend(begun.rows(alive), config.coarse_tolerance, jacobian[alive])
     if hypotheses and np.mean(state.residual**2) > config.misfit_threshold:
-        found = rough.explore(state, hypotheses)
-        if found is not state:
-            state, _ = rough.descend(found, config.coarse_tolerance)
-    problem, slopes = rough, None
+        explored = coarse.explore(state, hypotheses)
+        if explored is not state:
+            state, _ = coarse.descend(explored, config.coarse_tolerance)
+    problem, jacobian = coarse, None
     if first is not None:
-        problem = _Descent(residuals, space, config, progress, rough)
-        state, slopes = problem.start_with_slopes(state.x)
+        problem = _Descent(residuals, space, config, progress, coarse)
+        state, jacobian = problem.start_with_slopes(state.x)
         if not np.isfinite(state.objective[0]):
             raise NotReplayed(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
-    if problem is not rough or not rough.stands_still:
-        state, _ = problem.descend(state, jacobian=slopes)
-    hops = 0 if problem.misses(state) else config.basin_hops
+    if problem is not coarse or not coarse.ended:
+        state, _ = problem.descend(state, jacobian=jacobian)
+    hops = 0 if problem.has_misfit(state) else config.basin_hops
     if hops:
-        state = problem.back(state)
-    state, slopes, settled = problem.hopped(state, hops)
+        state = problem.reset(state)
+    state, jacobian, settled = problem.hop_basins(state, hops)
     return Refined(
         space=space,
         x=state.x[0],
         best=space.from_search(state.x[0]),
         objective=float(state.objective[0]),
         residual=state.residual[0],
-        jacobian=problem.wide_jacobian(state, problem.slopes(state) if slopes is None else slopes),
+        jacobian=problem.wide_jacobian(state, problem.last_jacobian(state) if jacobian is None else jacobian),
         prior=problem.prior,
         starts=ended,
         evaluations=problem.evaluations,
@@ -224,10 +264,10 @@ def refine(
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A first look at what a refinement would find.
+    """A cheap preview of a refinement, from a known Jacobian.
 
-    space: of what is free; starts: [S, D] in it; jacobian: [M, D] known from elsewhere; rows: values [P, D] -> what the
-    batch of replays takes, [P, W].
+    space: of the D free parameters.  starts: [S, D] physical values.  jacobian: [M, D], by search coordinates.
+    rows: values [P, D] -> rows [P, W] of the batch of replays.
     """
 
     space: Space
@@ -239,9 +279,14 @@ class Look:
 def chords(
     residuals: Residuals, looks: Sequence[Look], config: LevenbergMarquardtConfig | None = None
 ) -> list[tuple[np.ndarray, float]]:
-    """What steps with known Jacobians reach: of each look values [D] and objective of its best start.
+    """Take Levenberg-Marquardt steps with known Jacobians; return values [D] and objective of each look's best start.
 
-    A few batches of trials, of all looks at once, and no differences.
+    It takes a few batches of candidate steps, of all looks at once, and no differences.
+
+    Args:
+        residuals: rows [P, W] -> [P, M] whitened residuals.
+        looks: previews.
+        config: settings of the steps; None for the defaults.
     """
     config = config or LevenbergMarquardtConfig()
     problems = [DampedProblem(residuals, look.space, config) for look in looks]
@@ -257,21 +302,21 @@ def chords(
         for k, (problem, look) in enumerate(zip(problems, looks, strict=True))
     }
     states = {k: problems[k].begun(begin[k], residual) for k, residual in replayed(begin).items()}
-    slopes = {k: np.repeat(look.jacobian[None], len(begin[k]), axis=0) for k, look in enumerate(looks)}
-    going = list(states)
+    jacobians = {k: np.repeat(look.jacobian[None], len(begin[k]), axis=0) for k, look in enumerate(looks)}
+    active = list(states)
     for _ in range(config.chords):
-        trials = {k: problems[k].trials(states[k], slopes[k]) for k in going}
+        trials = {k: problems[k].trials(states[k], jacobians[k]) for k in active}
         after = {k: problems[k].taken(states[k], trials[k], residual) for k, residual in replayed(trials).items()}
-        going = [k for k in going if problems[k].paid(states[k], after[k])]
+        active = [k for k in active if problems[k].paid(states[k], after[k])]
         states |= after
-        if not going:
+        if not active:
             break
     best = [states[k].rows(int(np.argmin(states[k].objective))) for k in range(len(looks))]
     return [(look.space.from_search(end.x), float(end.objective)) for look, end in zip(looks, best, strict=True)]
 
 
 class _Descent(DampedProblem):
-    """Iterations until they no longer pay, and the ways out of a basin."""
+    """Iterations until they fail, and the ways out of a local minimum."""
 
     def __init__(
         self,
@@ -283,111 +328,113 @@ class _Descent(DampedProblem):
     ) -> None:
         super().__init__(residuals, space, config, before)
         self.config, self.progress = config, progress
-        self.given_up, self.stands_still = False, False
+        self.given_up, self.ended = False, False
 
     def excess(self, state: Starts) -> np.ndarray:
-        """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
+        """Return the part [S] of the objectives above that of noise alone, half a unit for each residual."""
         return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
 
     def descend(
-        self, state: Starts, rough: float = 0.0, jacobian: np.ndarray | None = None
+        self, state: Starts, coarse: float = 0.0, jacobian: np.ndarray | None = None
     ) -> tuple[Starts, np.ndarray]:
-        """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
+        """Iterate until the best start does not improve; return it, and the final objective [S] of each start.
 
-        rough: a share of the objective that is not worth an iteration either.  jacobian: [S, M, D] at `state`, where it
-        is known.  `stands_still` then says whether an iteration without `rough` would pay either.
+        `ended` is then whether another descent from there, with `coarse` 0, would end at once.
+
+        coarse: share of the objective by which an iteration must lower it as well (`coarse_tolerance`).
+        jacobian: [S, M, D] at `state`, if it is known.
         """
-        ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
-        keep, idle, still = self.config.pruning_ratio, 0, 0
+        final, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
+        ratios, failed, failed_finely = self.config.pruning_ratio, 0, 0
         for number in range(self.config.iterations - self.iterations):
-            state, gain = self.step(state, jacobian=None if number else jacobian)
-            ended[alive] = state.objective
-            leader = int(np.argmin(state.objective))
-            self._report(state.objective[leader], state.residual.shape[1])
-            least = self.least(state)
-            idle = 0 if gain[leader] > max(least, rough * state.objective[leader]) else idle + 1
-            still = 0 if gain[leader] > least else still + 1
-            # One that found nothing at all may yet with slopes over another width.
-            self.stands_still = still >= self.config.patience and bool(gain[leader] > 0)
-            if idle == (1 if rough else self.config.patience):
+            state, decrease = self.step(state, jacobian=None if number else jacobian)
+            final[alive] = state.objective
+            best = int(np.argmin(state.objective))
+            self._report(state.objective[best], state.residual.shape[1])
+            least = self.least_decrease(state)
+            failed = 0 if decrease[best] > max(least, coarse * state.objective[best]) else failed + 1
+            failed_finely = 0 if decrease[best] > least else failed_finely + 1
+            # A start that did not move at all may yet, with wider differences.
+            self.ended = failed_finely >= self.config.patience and bool(decrease[best] > 0)
+            if failed == (1 if coarse else self.config.patience):
                 break
             self.given_up = bool(
-                self.config.give_up * gain[leader] < state.objective[leader] - self.config.target_objective
+                self.config.give_up * decrease[best] < state.objective[best] - self.config.target_objective
             )
             if self.given_up:
-                self.stands_still = bool(gain[leader] > 0)
+                self.ended = bool(decrease[best] > 0)
                 break
-            good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
-            good &= self.apart(state, state.rows([leader])) | (np.arange(len(state.x)) == leader)
+            good = state.objective <= ratios[min(number, len(ratios) - 1)] * state.objective[best]
+            good &= self.differs(state, state.rows([best])) | (np.arange(len(state.x)) == best)
             state, alive = state.rows(good), alive[good]
-        return state.rows([int(np.argmin(state.objective))]), ended
+        return state.rows([int(np.argmin(state.objective))]), final
 
-    def apart(self, state: Starts, other: Starts) -> np.ndarray:
-        """[S] bool, whether starts replay otherwise than another one [1], which is no worse than they are."""
-        between = 0.5 * np.sum((state.residual - other.residual) ** 2, axis=1)
-        return between > max(self.config.tolerance, self.config.same_basin * float(self.excess(other)[0]))
+    def differs(self, state: Starts, other: Starts) -> np.ndarray:
+        """Return whether [S] the replays of starts differ from those of another one [1] (`RefineConfig.same_basin`)."""
+        difference = 0.5 * np.sum((state.residual - other.residual) ** 2, axis=1)
+        return difference > max(self.config.tolerance, self.config.same_basin * float(self.excess(other)[0]))
 
-    def back(self, state: Starts) -> Starts:
-        """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
+    def reset(self, state: Starts) -> Starts:
+        """Reset distant, hardly constrained parameters to their initial means, and descend from there.
 
-        In logarithms a small mass is a plateau, and a finger that sticks is one in its friction: where another
-        parameter pushed them there, no slope leads back.  Not with the last iterations: they are for what is there.
+        The objective is flat in the logarithm of a small mass, and in the friction of a finger that sticks.  If another
+        parameter pushed them there, no slope leads back.  The last iterations are reserved for the present basin.
         """
         tried, last = set[str](), self.config.iterations - 2 * (self.config.hold_iterations + 1)
-        while self.iterations <= last and (strayed := [n for n in self.strayed(state) if n not in tried]):
-            tried.update(strayed)
-            means = {name: self.space[name].mean for name in strayed}
-            alone = [{name: mean} for name, mean in means.items()]
-            found = self.explore(state, [*alone, means] if len(alone) > 1 else alone)
-            if fall(state.objective, found.objective)[0] <= self.least(state):
+        while self.iterations <= last and (names := [n for n in self.distant(state) if n not in tried]):
+            tried.update(names)
+            means = {name: self.space[name].mean for name in names}
+            single = [{name: mean} for name, mean in means.items()]
+            explored = self.explore(state, [*single, means] if len(single) > 1 else single)
+            if fall(state.objective, explored.objective)[0] <= self.least_decrease(state):
                 break
-            state, _ = self.descend(found)
+            state, _ = self.descend(explored)
         return state
 
-    def misses(self, state: Starts) -> bool:
-        """Whether the leader is so far from the data that the model must lack something."""
-        left: np.ndarray = state.residual[0]
-        return float(left @ left) > self.config.basin_hop_misfit * len(left)
+    def has_misfit(self, state: Starts) -> bool:
+        """Return whether the mean square of the first start's residuals is above `basin_hop_misfit`."""
+        residual: np.ndarray = state.residual[0]
+        return float(residual @ residual) > self.config.basin_hop_misfit * len(residual)
 
-    def least(self, state: Starts) -> float:
-        """By how much the best objective must fall for it to be worth an iteration."""
-        leader = int(np.argmin(state.objective))
-        return max(self.config.tolerance, self.config.excess_tolerance * float(self.excess(state)[leader]))
+    def least_decrease(self, state: Starts) -> float:
+        """Return the decrease of the best objective below which an iteration has failed."""
+        best = int(np.argmin(state.objective))
+        return max(self.config.tolerance, self.config.excess_tolerance * float(self.excess(state)[best]))
 
-    def strayed(self, state: Starts) -> list[str]:
-        """Parameters of interest far from their initial means that the data do not tell sharply."""
-        slopes = self.slopes(state)
-        deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
-        far, open_ = np.abs(state.x[0]) > self.config.reset_distance, deviation > self.config.reset_deviation
-        which = ~self.space.nuisance & far & open_
+    def distant(self, state: Starts) -> list[str]:
+        """Return the parameters of interest that are far from their initial means and hardly constrained."""
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature(self.last_jacobian(state), self.prior))))
+        far = np.abs(state.x[0]) > self.config.reset_distance
+        unconstrained = deviation > self.config.reset_deviation
+        which = ~self.space.nuisance & far & unconstrained
         return [self.space.names[k] for k in np.flatnonzero(which)]
 
-    def hopped(self, state: Starts, hops: int) -> tuple[Starts, np.ndarray | None, bool]:
-        """Leave small basins, as often as that pays and no more than `hops` times; one start.
+    def hop_basins(self, state: Starts, hops: int) -> tuple[Starts, np.ndarray | None, bool]:
+        """Search for better basins around one start, at most `hops` times.
 
-        Returns where that ended, its slopes [M, D] where they are known, and whether a hop found nothing more, or none
-        was to be made.
+        Returns the final start, its Jacobian [M, D] if it is known, and whether the last search found no better basin
+        (or `hops` is 0).
         """
-        settled, slopes = hops == 0, None
+        settled, jacobian = hops == 0, None
         for number in range(hops):
-            slopes = self.slopes(state)
-            hopped = self.hop(state, slopes, number)
+            jacobian = self.last_jacobian(state)
+            hopped = self.hop(state, jacobian, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]
             least = max(self.config.basin_hop_tolerance, excess)
             settled = bool(state.objective[0] - hopped.objective[0] <= least)
             if hopped.objective[0] < state.objective[0]:
-                state, slopes = hopped, None
+                state, jacobian = hopped, None
             if settled:
                 break
             state, _ = self.descend(state)
-            slopes = None
-        return state, slopes, settled
+            jacobian = None
+        return state, jacobian, settled
 
     def hop(self, state: Starts, jacobian: np.ndarray, seed: int) -> Starts:
-        """Leave a small basin: CMA-ES in the metric of the posterior, from a start that stands still.
+        """Search with CMA-ES in the metric of the posterior, around one start that has converged.
 
-        In x = x0 + L u, L L^T the posterior's covariance, the objective is about |u|^2 / 2 and what
-        remains are the steps where a finger begins to stick or to slip, which no derivative sees.
+        In x = x0 + L u, with L L^T the posterior's covariance, the objective is about |u|^2 / 2.  The exceptions are
+        steps where a finger begins to stick or to slip, which no derivative shows.
         """
         factor = self.axes(jacobian, self.config.basin_hop_longest)
 
@@ -408,14 +455,14 @@ class _Descent(DampedProblem):
         )
         try:
             return self.start(around(cma_search(cost, unit, settings).best[None]))
-        except NotReplayed:  # nothing around here can be
+        except NotReplayed:  # every point around this one blows up
             return state
 
     def explore(self, state: Starts, hypotheses: Hypotheses) -> Starts:
-        """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
+        """Refine each hypothesis from a converged start, first with its values fixed, then with all parameters free.
 
-        After each iteration only the best of them go on, and of these only those in another basin than `state`, one
-        start.  Returns the better of what they found and `state`.
+        After each iteration only the best hypotheses continue, if they are in another basin than `state`, one start.
+        Returns the better of their best result and `state`.
         """
         x = np.repeat(state.x, len(hypotheses), axis=0)
         held = np.zeros(x.shape, bool)
@@ -430,17 +477,17 @@ class _Descent(DampedProblem):
             return state
         branches, held, slopes = branches.rows(alive), held[alive], slopes[alive]
         for iteration in range(self.config.hold_iterations + 1):
-            still = held if iteration < self.config.hold_iterations else None
-            branches, _ = self.step(branches, still, None if iteration else slopes)
-            ahead = np.argsort(branches.objective)[: self.config.followed]
-            if iteration < self.config.hold_iterations:  # what is back in the basin that it left has nothing to find
-                other = (branches.objective < state.objective[0]) | self.apart(branches, state)
-                ahead = ahead[other[ahead]]
-            if not len(ahead):
+            fixed = held if iteration < self.config.hold_iterations else None
+            branches, _ = self.step(branches, fixed, None if iteration else slopes)
+            best_first = np.argsort(branches.objective)[: self.config.followed]
+            if fixed is not None:
+                other = (branches.objective < state.objective[0]) | self.differs(branches, state)
+                best_first = best_first[other[best_first]]
+            if not len(best_first):
                 return state
-            branches, held = branches.rows(ahead), held[ahead]
-        found = branches.rows([int(np.argmin(branches.objective))])
-        best = found if found.objective[0] < state.objective[0] else state
+            branches, held = branches.rows(best_first), held[best_first]
+        explored = branches.rows([int(np.argmin(branches.objective))])
+        best = explored if explored.objective[0] < state.objective[0] else state
         self._report(best.objective[0], best.residual.shape[1])
         return best
 

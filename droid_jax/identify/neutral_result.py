@@ -1,7 +1,7 @@
-"""A fit for programs that have MuJoCo and not this one: the user's MJCF, fitted.json and apply_fit.py.
+"""A fit for programs without this package: the user's MJCF, fitted.json and apply_fit.py.
 
-fitted.json holds every number that the fit changed, the laws that no MJCF can hold as tables, and the Gaussian;
-docs/results-folder.md lists its entries.  apply_fit.py reads it with numpy and mujoco alone.
+fitted.json holds all numbers that the fit changed, tables of the laws that MJCF cannot express, and the Gaussian;
+docs/results-folder.md lists its entries.  apply_fit.py reads it and needs only numpy and mujoco.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from droid_jax.model.physics import entries_written, make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.storage import write_bytes, write_text
 
-DIGITS = 7  # of the tables' numbers
-DRAWS = 1000  # behind the interval of a number that several parameters write
-OF_RECORDING = "belongs to the recording, not to the machine"
-WHY = {
-    Role.TIME_OFFSET: f"delay of the commands against the measurement's clock; {OF_RECORDING}",
-    Role.TORQUE_OFFSET: "offset of a torque sensor: it changes what is read, not what moves",
-    Role.TORQUE_GAIN: "gain of a torque sensor: it changes what is read, not what moves",
-    Role.VISCOUS: "friction behind a torque sensor: it changes what is read, not what moves",
-    Role.COULOMB: "friction behind a torque sensor: it changes what is read, not what moves",
+DIGITS = 7  # significant digits of the tables
+DRAWS = 1000  # for the interval of a number that several parameters write
+# Why a parameter of a role is not in the MJCF.
+NOT_IN_MJCF = {
+    Role.TIME_OFFSET: "delay of the commands against the measurement's clock; a property of the recording, not of the "
+    "machine",
+    Role.TORQUE_OFFSET: "offset of a torque sensor: it changes the reading, not the motion",
+    Role.TORQUE_GAIN: "gain of a torque sensor: it changes the reading, not the motion",
+    Role.VISCOUS: "friction behind a torque sensor: it changes the reading, not the motion",
+    Role.COULOMB: "friction behind a torque sensor: it changes the reading, not the motion",
 }
 
 
@@ -57,36 +58,36 @@ def write_neutral(
         scene: that was fitted.
         gaussian: over all fitted parameters.
         values: [D] fitted values over its space.
-        effects: of the model, with functions of their own or without.
+        effects: of the model.
         main: name of the MJCF, "fitted.xml".
-        checks: by recording, how far plain C MuJoCo is from the replay at the fitted values.
+        checks: by recording, difference of plain C MuJoCo from the replay at the fitted values.
 
     Returns:
-        Why there is no MJCF, empty where there is one.
+        Why there is no MJCF; empty if there is one.
     """
-    space, error, made = gaussian.space, "", None
+    space, error, mjcf = gaussian.space, "", None
     try:
-        made = fitted_files(scene, space, values, effects, main)
-    except ValueError as fault:  # the fit itself is whole
+        mjcf = fitted_files(scene, space, values, effects, main)
+    except ValueError as fault:  # the other files are still written
         error = str(fault)
     parts, patch = folder / f"{Path(main).stem}_parts", folder / f"{Path(main).stem}.patch"
-    shutil.rmtree(parts, ignore_errors=True)  # of a fit before
+    shutil.rmtree(parts, ignore_errors=True)  # of an earlier fit
     for path in (patch, folder / main):
         path.unlink(missing_ok=True)
-    for name, text in (made.files if made else {}).items():
+    for name, text in (mjcf.files if mjcf else {}).items():
         write_text(folder / name, text)
-    if made is not None and made.in_place:
-        write_text(patch, made.patch)
-    content = neutral_json(scene, gaussian, values, effects, made, error, checks or {})
+    if mjcf is not None and mjcf.in_place:
+        write_text(patch, mjcf.patch)
+    content = neutral_json(scene, gaussian, values, effects, mjcf, error, checks or {})
     write_text(folder / FITTED_JSON, _lines(content))
-    own = Path(apply_fit.__file__)
-    write_bytes(folder / APPLY_FIT, own.read_bytes())
-    write_bytes(folder / MJLAB_TERMS, own.with_name(MJLAB_TERMS).read_bytes())  # read, since few have what it imports
+    source = Path(apply_fit.__file__)
+    write_bytes(folder / APPLY_FIT, source.read_bytes())
+    write_bytes(folder / MJLAB_TERMS, source.with_name(MJLAB_TERMS).read_bytes())  # not imported: it needs mjlab
     return error
 
 
 def _lines(content: Mapping[str, Any]) -> str:
-    """JSON with a line for each entry, and for each in a list of objects: tables are long, and diffs are read."""
+    """JSON with a line for each entry and each object of a list, which keeps diffs of long tables readable."""
 
     def text(value: Any) -> str:
         if isinstance(value, list) and value and isinstance(value[0], dict):
@@ -101,32 +102,37 @@ def neutral_json(
     gaussian: Gaussian,
     values: np.ndarray,
     effects: Sequence[Effect],
-    made: FittedFiles | None,
+    mjcf: FittedFiles | None,
     error: str,
     checks: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The content of fitted.json (docs/results-folder.md)."""
+    """Return the content of fitted.json (docs/results-folder.md).
+
+    mjcf: the files of the MJCF, or None, with the reason in `error`.  For the other arguments see `write_neutral`.
+    """
     space = gaussian.space
     named = dict(zip(space.names, np.asarray(values, float).tolist(), strict=True))
     intervals = dict(zip(space.names, np.stack(gaussian.interval(0.9), axis=1).tolist(), strict=True))
     priors = dict(zip(space.names, np.stack(prior(space).interval(0.9), axis=1).tolist(), strict=True))
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
     laws = [e for e in effects if e.profile or e.command or e.servo or e.force or e.frictionloss]
-    fitted = with_numbers(scene, space, np.asarray(values)) if laws else None  # not of a scene that MJX has not
+    fitted = (
+        with_numbers(scene, space, np.asarray(values)) if laws else None
+    )  # MJX may not support a scene without laws
     tables = list(law_tables(scene, fitted, laws, named, deviations))
-    dry = [t.joint for t in tables if isinstance(t, LawTable) and t.acts == "frictionloss"]
-    rows = _rows(scene, space, effects, np.asarray(values), made, dry)
+    friction_joints = [t.joint for t in tables if isinstance(t, LawTable) and t.acts == "frictionloss"]
+    rows = _rows(scene, space, effects, np.asarray(values), mjcf, friction_joints)
     drawn = [dict(zip(space.names, row, strict=True)) for row in gaussian.sample(0, DRAWS).tolist()]
     inertias = _inertias(scene, space)
     for row in rows:
         row |= {"value": apply_fit.number_of(row, named), "interval": _interval(row, intervals, drawn)}
         row["prior"] = _interval(row, priors, [])
     for inertia in inertias:
-        _weigh(rows, inertia, named, drawn)
-    at = {(row["field"], *row["own"]): row for row in rows}
+        _set_inertia_rows(rows, inertia, named, drawn)
+    by_entry = {(row["field"], *row["own"]): row for row in rows}
     changes = [
-        {**asdict(c), "interval": None, "unit": ""} | _of_row(at.get((c.field, *c.entry)), c.before, c.after)
-        for c in (made.changes if made else ())
+        {**asdict(c), "interval": None, "unit": ""} | _of_row(by_entry.get((c.field, *c.entry)), c.after)
+        for c in (mjcf.changes if mjcf else ())
     ]
     return {
         "format": apply_fit.FORMAT,
@@ -145,10 +151,10 @@ def neutral_json(
         "drives": _drives(scene, make_c_model(scene, space, np.asarray(values))),
         "not_in_mjcf": _lacking(scene, space, effects, tables),
         "mjcf": {
-            "file": None if made is None else next(iter(made.files)),
+            "file": None if mjcf is None else next(iter(mjcf.files)),
             "error": error,
-            "in_place": bool(made and made.in_place),
-            "reason": made.reason if made else "",
+            "in_place": bool(mjcf and mjcf.in_place),
+            "reason": mjcf.reason if mjcf else "",
             "changes": [{k: v for k, v in c.items() if k not in ("field", "entry")} for c in changes],
         },
         "engines": {name: _check(check) for name, check in checks.items() if check.parity_rms is not None},
@@ -162,7 +168,7 @@ def neutral_json(
 
 
 def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """The position servo of each driven joint in the terms that Isaac Lab and Newton have for it, all at the joint."""
+    """The position servo of each driven joint in the terms of Isaac Lab and Newton, all at the joint's side."""
     out: list[dict[str, Any]] = []
     for joint in scene.driven_joints:
         u, j, d = scene.command_names.index(joint), scene.id("joint", joint), scene.dof(joint)
@@ -179,16 +185,16 @@ def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
 
 
 def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:
-    """The mjx.Model with the numbers that parameters write; what MuJoCo derives from them is the scene's."""
+    """Return the scene's mjx.Model with the fields that parameters write; derived fields are not updated."""
     model = make_c_model(scene, space, values)
     fields = {field for field, _ in entries_written(space)}
     return scene.mjx.replace(**{f: np.asarray(getattr(model, f), np.float32) for f in sorted(fields)})
 
 
 def _check(check: Any) -> dict[str, Any]:
-    """How far plain C MuJoCo is from the replay."""
-    kept = ("channel", "unit", "parity_rms", "parity_largest", "parity_angle", "discretisation")
-    return {key: getattr(check, key) for key in kept}
+    """Difference of plain C MuJoCo from the replay."""
+    keys = ("channel", "unit", "parity_rms", "parity_largest", "parity_angle", "discretisation")
+    return {key: getattr(check, key) for key in keys}
 
 
 def _parameter(p: Parameter, value: float, interval: list[float]) -> dict[str, Any]:
@@ -204,42 +210,46 @@ def _rows(
     space: Space,
     effects: Sequence[Effect],
     values: np.ndarray,
-    made: FittedFiles | None,
-    dry: Sequence[str],
+    mjcf: FittedFiles | None,
+    friction_joints: Sequence[str],
 ) -> list[dict[str, Any]]:
-    """A row for every number of the model that parameters write, those in which an MJCF states a law, and those that a
-    fit changed besides; dry: joints with a law of friction.
+    """A row for every number of the model that `apply_fit` sets.
+
+    These are the numbers that parameters write, that express an effect's law in the MJCF, or that the fit changed in
+    the scene.
+
+    friction_joints: joints with a law of friction.
     """
     writes: dict[tuple[str, tuple[int, ...]], list[dict[str, Any]]] = {}
     for p in space.parameters:
         for w in p.writes:
             if w.field == PSEUDO_INERTIA:
-                own = [(f, k) for f in WEIGHTS for k in np.ndindex(getattr(scene.model, f)[w.index[0]].shape)]
-                writes.update({(f, (w.index[0], *k)): [] for f, k in own})
+                entries = [(f, k) for f in WEIGHTS for k in np.ndindex(getattr(scene.model, f)[w.index[0]].shape)]
+                writes.update({(f, (w.index[0], *k)): [] for f, k in entries})
                 continue
-            one = {"parameter": p.name, "mode": w.mode.value, "gain": w.gain, "offset": w.offset}
-            writes.setdefault((w.field, w.index), []).append(one)
+            write = {"parameter": p.name, "mode": w.mode.value, "gain": w.gain, "offset": w.offset}
+            writes.setdefault((w.field, w.index), []).append(write)
     model = make_c_model(scene, space, values)
-    for effect in effects:  # its law has a table; the number that the MJCF has for it goes back
+    for effect in effects:  # the table holds its law, so the number that expresses it in the MJCF is set to nominal
         for field, row in native(effect, space, values, model) or {}:
             writes.setdefault((field, (int(row),)), [])
-    for joint in scene.held:  # whose friction the fit held, and creeps as the MJCF has it
+    for joint in scene.held:  # the fit changed solimp so that these joints do not creep
         for dof in np.flatnonzero(scene.model.dof_jntid == scene.id("joint", joint)).tolist():
             for k in range(2):
                 writes.setdefault(("dof_solimp", (dof, k)), [])
-    for joint in dry:  # `Laws` works on this number, and starts from the fit's each time
+    for joint in friction_joints:  # `Laws` changes this number in every step
         writes.setdefault(("dof_frictionloss", (scene.dof(joint),)), [])
-    said = {(c.field, c.entry): (c.attribute, c.index) for c in (made.changes if made else ())}
-    return [_row(scene, field, index, of, said) for (field, index), of in writes.items()]
+    attributes = {(c.field, c.entry): (c.attribute, c.index) for c in (mjcf.changes if mjcf else ())}
+    return [_row(scene, field, index, of, attributes) for (field, index), of in writes.items()]
 
 
 def _inertias(scene: Scene, space: Space) -> list[dict[str, Any]]:
-    """Bodies whose whole inertia is a parameter: the root of their pseudo-inertia, and what sets its ten terms."""
-    found = dict[int, list[dict[str, Any] | None]]()
+    """Bodies whose full inertia is fitted: the root of their pseudo-inertia, and the parameters of its ten terms."""
+    bodies = dict[int, list[dict[str, Any] | None]]()
     for p in space.parameters:
         for w in p.writes:
             if w.field == PSEUDO_INERTIA:
-                terms = found.setdefault(w.index[0], [None] * len(TERMS))
+                terms = bodies.setdefault(w.index[0], [None] * len(TERMS))
                 terms[w.index[1]] = {"parameter": p.name, "gain": w.gain, "offset": w.offset}
     return [
         {
@@ -248,20 +258,20 @@ def _inertias(scene: Scene, space: Space) -> list[dict[str, Any]]:
             "root": root_of(*(np.asarray(getattr(scene.model, f)[body], float) for f in WEIGHTS)).tolist(),
             "terms": terms,
         }
-        for body, terms in found.items()
+        for body, terms in bodies.items()
     ]
 
 
-def _weigh(
+def _set_inertia_rows(
     rows: Sequence[dict[str, Any]], inertia: dict[str, Any], values: dict[str, float], drawn: list[dict[str, float]]
 ) -> None:
-    """Values and intervals of the rows of a body whose whole inertia is a parameter, by its draws."""
+    """Set values and intervals of the rows of a body whose full inertia is fitted; the intervals are of draws."""
     best, draws = apply_fit.inertia_of(inertia, values), [apply_fit.inertia_of(inertia, each) for each in drawn]
     for row in rows:
         if row["field"] in WEIGHTS and row["own"][0] == inertia["id"]:
             at = row["own"][1:]
             row["value"] = float(best[row["field"]][at])
-            if row["field"] != "body_iquat":  # nearly equal moments change places from draw to draw, and axes with them
+            if row["field"] != "body_iquat":  # the order of nearly equal moments, and so the axes, differ between draws
                 row["interval"] = np.quantile([d[row["field"]][at] for d in draws], [0.05, 0.95]).tolist()
 
 
@@ -270,8 +280,9 @@ def _row(
     field: str,
     index: tuple[int, ...],
     writes: list[dict[str, Any]],
-    said: Mapping[tuple[str, tuple[int, ...]], tuple[str, int]],
+    attributes: Mapping[tuple[str, tuple[int, ...]], tuple[str, int]],
 ) -> dict[str, Any]:
+    """The row of a number of the model; attributes: MJCF attribute, and index in it, of the numbers of the MJCF."""
     model, kind = scene.model, field.split("_")[0].rstrip("0")
     first, rest, offset = index[0], index[1:], 0
     number, column = first, rest[0] if rest else None
@@ -282,14 +293,14 @@ def _row(
         number = int(np.searchsorted(model.jnt_qposadr, first, side="right")) - 1
     element = {"dof": "joint", "jnt": "joint", "qpos": "joint"}.get(kind, kind)
     spec, attribute = mjcf_attribute(field)
-    attribute, place = said.get((field, index), (attribute, column or 0))
+    attribute, position = attributes.get((field, index), (attribute, column or 0))
     slides = element == "joint" and model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE
     return {
         "element": element,
         "name": getattr(model, element)(number).name,
         "id": int(scene.full_geom_ids[number]) if element == "geom" else int(number),
         "attribute": attribute,
-        "index": place,
+        "index": position,
         "unit": field_unit(field, bool(slides)),
         "field": field,
         "column": column,
@@ -305,7 +316,7 @@ def _row(
 def _interval(
     row: Mapping[str, Any], intervals: Mapping[str, list[float]], drawn: list[dict[str, float]]
 ) -> list[float] | None:
-    """90 % interval of a row's number: of its parameter, or of draws where several write it."""
+    """90 % interval of a row's number: of its parameter, or of draws if several parameters write it."""
     names = {w["parameter"] for w in row["writes"]}
     if len(names) == 1:
         (name,) = names
@@ -315,8 +326,8 @@ def _interval(
     return np.quantile([apply_fit.number_of(dict(row), values) for values in drawn], [0.05, 0.95]).tolist()
 
 
-def _of_row(row: Mapping[str, Any] | None, before: float, after: float) -> dict[str, Any]:
-    """Interval and unit of a changed number, in the words of the MJCF: of another sign, or in degrees."""
+def _of_row(row: Mapping[str, Any] | None, after: float) -> dict[str, Any]:
+    """Interval and unit of a changed number as the MJCF states it, which may have another sign or be in degrees."""
     if row is None or row["interval"] is None:
         return {}
     number, ends = row["value"], row["interval"]
@@ -335,7 +346,7 @@ def _law(law: LawTable) -> dict[str, Any]:
 
 
 def _short(numbers: np.ndarray) -> Any:
-    """Numbers of a table with as many digits as they are worth."""
+    """Numbers of a table, rounded to DIGITS."""
     if numbers.ndim == 0:
         return float(f"{float(numbers):.{DIGITS}g}")
     return [_short(part) for part in numbers]
@@ -344,24 +355,24 @@ def _short(numbers: np.ndarray) -> Any:
 def _lacking(
     scene: Scene, space: Space, effects: Sequence[Effect], tables: Sequence[LawTable | NoTable]
 ) -> list[dict[str, str]]:
-    """What the MJCF does not hold, each with what to do about it."""
+    """Parameters that the MJCF does not hold, each with the reason and what applies it instead."""
     owner = {p.name: e for e in effects for p in e.parameters}
     out: list[dict[str, str]] = []
     for name in unwritten(scene, space):
         p, effect = space[name], owner.get(name)
         if effect is not None and not p.writes:
-            mine = [t for t in tables if t.effect == effect.name]
-            table = any(isinstance(t, LawTable) for t in mine)
-            without = next((t.why for t in mine if isinstance(t, NoTable)), "")
+            of_effect = [t for t in tables if t.effect == effect.name]
+            has_table = any(isinstance(t, LawTable) for t in of_effect)
+            without = next((t.why for t in of_effect if isinstance(t, NoTable)), "")
             why = (
-                "`forces` of apply_fit.py has its law" + (", but not what is read otherwise" if effect.observe else "")
-                if table
-                else without or ("it changes what is read, not what moves" if effect.observe else "it has no table")
+                "`forces` of apply_fit.py has its law" + (", but not its effect on readings" if effect.observe else "")
+                if has_table
+                else without or ("it changes the reading, not the motion" if effect.observe else "it has no table")
             )
             why = f"{effect.description}; {why}"
         elif p.writes:
             why = "MJCF has no attribute for it; `apply` of apply_fit.py writes it into a compiled MjModel"
         else:
-            why = WHY.get(p.role, "it lives outside the model")
+            why = NOT_IN_MJCF.get(p.role, "it lives outside the model")
         out.append({"parameter": name, "why": why})
     return out

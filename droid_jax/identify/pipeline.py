@@ -1,4 +1,4 @@
-"""Identification from recordings to a Gaussian: split, search, refine, calibrate, judge on held-out repeats."""
+"""Identification from recordings to a Gaussian: split, search, refine, calibrate, evaluate on held-out data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.divergence import blow_up
 from droid_jax.identify.fit import Fit, grip_hypotheses, search_cost, starts, with_acting
 from droid_jax.identify.gaussian import Gaussian, prior, space_to_json
-from droid_jax.identify.holdout import WORTH, HeldoutDistance, beginning, heldout_distances, split_repeats
+from droid_jax.identify.holdout import (
+    WORTH,
+    BeginningConfig,
+    HeldoutDistance,
+    beginning,
+    heldout_distances,
+    split_repeats,
+)
 from droid_jax.identify.identifiability import (
     Identifiability,
     IdentifiabilityConfig,
@@ -29,9 +36,9 @@ from droid_jax.identify.identifiability import (
     posterior,
     step_shift,
 )
-from droid_jax.identify.multistart import RefineConfig, Refined, refine
+from droid_jax.identify.multistart import RefineConfig, Refined, RefineInCConfig, refine
 from droid_jax.identify.search import CmaConfig, cma_search
-from droid_jax.identify.solution_checks import SolutionCheck, check_solution
+from droid_jax.identify.solution_checks import SolutionCheck, SolutionCheckConfig, check_solution
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import possible_draws
@@ -49,26 +56,31 @@ class IdentifyConfig:
 
     Attributes:
         engine: "mjx", "mujoco" (plain C, all cores), or "auto": `simulate.engine.choose_engine` chooses.
-        heldout: share of each recording's repeats that the fit does not see (at least one where there are two).
-        search: CMA-ES settings; it sees the first recording alone, the refinement sees all of them.
-        refine: refinement settings, or None: the search's own covariance is the distribution, as in the paper.
-        beginning: s of long recordings that the search and the first refinement see, and more until every joint has
-            moved through half of its range; the last refinement sees all.
-        sorting: iterations of the refinement that tell whether effects that do not act would (`fit.with_acting`),
-        sorting_ratio: and their `RefineConfig.pruning_ratio`.
-        samples: replays drawn from the initial and from the fitted Gaussian to compare their costs, at most.
-        sample_steps: time steps that these replays may take together; of long recordings there are fewer of them.
-        seed: of those samples (the search has its own).
+        heldout: share of each recording's repeats that is held out (at least one of two).
+        search: CMA-ES settings. It uses the first recording only, the refinement uses all of them.
+        refine: refinement settings, or None: the search's covariance is the distribution, as in the paper.
+        refine_in_c: settings of the refinement that are different in plain C MuJoCo.
+        beginning: s of long recordings that the search and the first refinement use, and more until every command has
+            covered half of its range. The last refinement uses the full recordings.
+        beginning_rule: when a recording is long, and how much of it is used.
+        sorting: iterations of the refinement that compare neutral effects with active ones (`fit.with_acting`).
+        sorting_ratio: `RefineConfig.pruning_ratio` of these iterations.
+        firm_grip: factor on the initial means of the friction of pads, for a start with a grip that does not slip.
+        samples: draws of the initial and of the fitted Gaussian whose costs are compared, at most.
+        sample_steps: time steps of all replays of these draws, at most; there are fewer draws for long recordings.
+        least_samples: draws at least, also for long recordings, so that they show the spread.
+        seed: of these draws (the search has its own).
         compare: how simulation and measurement are compared.
         channels: the measured channels to fit. Several are weighted by their noise (`channels.in_noise_units`). None:
-            those of `compare` where it names other ones, or weights, than its default, else what is informative
+            those of `compare` if it has other channels or weights than its default, else the informative ones
             (`channels.informative_channels`): torque, or without it position and the object's angle. Weights act in
-            the distance and the search alone; the refinement counts every channel by its noise.
-        identifiability: what decides the calibrated width, and when a parameter counts as identifiable.
-        worth: share of the noise floor by which the distance before the fit must exceed it, else there was nothing to
-            close and `HeldoutDistance.closed` is None.
-        checks: measure what the time step and the engine leave at the fitted values (`solution_checks`), which takes
-            one more compilation.
+            the distance and the search only; the refinement uses residuals in noise units.
+        identifiability: settings of the calibrated width, and of when a parameter counts as identifiable.
+        worth: share of the noise floor by which the distance before the fit must exceed it, else
+            `HeldoutDistance.closed` is None.
+        checks: measure the errors of the time step and of the engine at the fitted values (`solution_checks`), which
+            takes one more compilation.
+        solution: settings of these checks.
 
     Raises:
         ValueError: a setting is of the wrong type or out of its range.
@@ -78,17 +90,22 @@ class IdentifyConfig:
     heldout: float = 0.3
     search: CmaConfig = field(default_factory=CmaConfig)
     refine: RefineConfig | None = field(default_factory=RefineConfig)
+    refine_in_c: RefineInCConfig = field(default_factory=RefineInCConfig)
     beginning: float = 20.0
+    beginning_rule: BeginningConfig = field(default_factory=BeginningConfig)
     sorting: int = 3
     sorting_ratio: tuple[float, ...] = (3.0, 1.3, 1.0)
+    firm_grip: float = 4.0
     samples: int = 200
     sample_steps: int = 5_000_000
+    least_samples: int = 16
     seed: int = 0
     compare: CompareConfig = field(default_factory=CompareConfig)
     channels: tuple[str, ...] | None = None
     identifiability: IdentifiabilityConfig = field(default_factory=IdentifiabilityConfig)
     worth: float = WORTH
     checks: bool = True
+    solution: SolutionCheckConfig = field(default_factory=SolutionCheckConfig)
 
     def __post_init__(self) -> None:
         check_fields(
@@ -97,31 +114,39 @@ class IdentifyConfig:
             heldout=partial(number, least=0, below=1),
             search=partial(instance, kind=CmaConfig),
             refine=optional(partial(instance, kind=RefineConfig)),
+            refine_in_c=partial(instance, kind=RefineInCConfig),
             beginning=partial(number, above=0, infinite=True),
+            beginning_rule=partial(instance, kind=BeginningConfig),
             sorting=partial(whole, least=0),
             sorting_ratio=several(partial(number, least=1)),
+            firm_grip=partial(number, above=0),
             samples=partial(whole, least=0),
             sample_steps=partial(whole, least=1),
+            least_samples=partial(whole, least=0),
             seed=partial(whole, least=0),
             compare=partial(instance, kind=CompareConfig),
             channels=optional(several(partial(one_of, valid=SIMULATED))),
             identifiability=partial(instance, kind=IdentifiabilityConfig),
             worth=partial(number, least=0),
             checks=flag,
+            solution=partial(instance, kind=SolutionCheckConfig),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """Everything an identification found.
+    """The result of an identification.
 
-    space: what was searched; full: with the nuisances (the same where nothing was refined).
-    best: [F] physical values over `full`.  gaussian: over `space`, the one to hand on; full_gaussian
-    over `full`.  search: the CMA-ES part.  refined: or None.  identifiability: per parameter of `full`.
-    heldout_distances: by name of the recording that judges.  fit, heldout: costs over `full` on what was fitted and on
-    what judges.
-    heldout_repeats: by recording name.  seconds: by stage.  checks: by recording name, of those with commands.
-    config: the settings it was found with.  engine: that replayed, and why.
+    scene: what was simulated.  space: of the search.  full: the same with the nuisances, F parameters; equal to `space`
+    without a refinement.
+    best: [F] physical values over `full`.  gaussian: the resulting distribution over `space`.  full_gaussian: the same
+    over `full`.
+    search: result of CMA-ES.  refined: result of the refinement, or None.  identifiability: of each parameter of
+    `full`.
+    heldout_distances: by name of the recording with held-out data.  fit: cost over `full` of the fitted data.  heldout:
+    the same of the held-out data.
+    heldout_repeats: by recording name.  seconds: by stage.  checks: by name of recordings with commands.
+    config: settings.  engine: of the replays, and why it was chosen.
     """
 
     scene: Scene
@@ -148,22 +173,21 @@ class Identified:
         return self.full.mean
 
 
-Progress = Callable[[str, Any], None]
-# In plain C no block of trials is filled up with copies, nothing sticks or slips beside an optimum (contact pairs are
-# MJX's), and in double precision the first slopes already tell the posterior's axes.
-IN_C = {"dampings": (0.1, 1.0, 10.0, 1e3), "lengths": (1.0,), "patience": 2, "basin_hops": 0, "spreads": 1}
-FEWEST = 16  # samples of a Gaussian that show its spread
+Progress = Callable[[str, Any], None]  # name of a stage, and its progress value
 _FIELDS = tuple(Rollout.__dataclass_fields__)
 
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """What is to be identified, checked: costs over `full`, which is `space` with the nuisances that are fitted.
+    """Checked inputs of an identification, and its costs.
 
-    heldout_recordings: the repeats of each recording that the fit does not see; heldout_repeats: their numbers.
-    judges: whole recordings that judge instead; then no repeat is held out.  fit, heldout: costs on what is fitted and
-    on what judges.
-    early: as fit, of the beginnings of long recordings.  seconds: that this took.  engine: that replays.
+    scene, space, config, effects, recordings: as given.  full: `space` with the nuisances that are fitted.
+    heldout_recordings: held-out repeats of each recording, or whole held-out recordings.  heldout_repeats: the numbers
+    of the repeats.
+    judges: whole held-out recordings; then no repeat is held out.
+    fit: cost over `full` of the fitted data.  early: the same of the beginnings of long recordings.
+    heldout: the same of the held-out data.
+    fingerprint: of the search's cost, for checkpoints.  seconds: duration of the preparation.  engine: of the replays.
     """
 
     scene: Scene
@@ -200,21 +224,22 @@ def identify_parameters(
     Args:
         scene: what is simulated.
         space: the D parameters that the search moves.
-        recordings: to fit and, of their last repeats, to judge the fit.
-        nuisances: fitted and marginalised beside it in the refinement; None for none.
+        recordings: to fit. By default their last repeats are held out.
+        nuisances: parameters that the refinement fits too and marginalises over; None for none.
         config: settings; None for the defaults.
-        effects: in the model beside what the scene has; their parameters are in `space` or stay at neutral.
-        judge_on: whole recordings to judge the fit; all repeats of `recordings` are then fitted. None: the last repeats
-            judge, or the last part in time of a log; a commanded recording of one repeat is judged on itself.
-        checkpoints: folder where the search saves itself and from which it resumes.
+        effects: in the model in addition to the scene. Their parameters are in `space` or stay neutral.
+        judge_on: whole recordings to evaluate the fit on; all repeats of `recordings` are then fitted. If empty, the
+            last repeats are held out, or the last part in time of a log. A commanded recording of one repeat is
+            evaluated on itself.
+        checkpoints: folder to save the search to, and to resume it from.
         progress: called with a stage's name and its progress value.
 
     Returns:
-        Everything found; its `gaussian` is the distribution to hand on.
+        The result; its `gaussian` is the fitted distribution.
 
     Raises:
         ValueError: recordings of one name, no channel to compare, several recordings without the refinement (the
-            search sees the first alone), or initial means that cannot be simulated.
+            search uses the first only), or initial means that cannot be simulated.
     """
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judge_on)
     return run_fit(problem, checkpoints=checkpoints, progress=progress)
@@ -230,8 +255,9 @@ def prepare(
     effects: Sequence[Effect] = (),
     judge_on: Sequence[Recording] = (),
 ) -> Preparation:
-    """The part of `identify_parameters` before the search: whatever is wrong with the input is told here, and
-    nothing written.
+    """Check the inputs of `identify_parameters` and make its costs, without writing anything.
+
+    It raises all errors about the inputs, before anything takes long.  For the arguments see `identify_parameters`.
     """
     began = time.monotonic()
     config = instance(IdentifyConfig() if config is None else config, "config", IdentifyConfig)
@@ -262,9 +288,9 @@ def prepare(
     if len(chosen) > 1:
         config = replace(config, compare=replace(config.compare, channels=in_noise_units(base, full.mean)))
         base = base.against(fitted, config.compare)
-    for recording in (*recordings, *judges):  # whole: copies among its repeats may be fitted and held out
+    for recording in (*recordings, *judges):  # with all repeats: copies may be among the fitted and the held-out ones
         warn_of_log(scene, recording)
-    # now, since what is held out may have faults of its own, and those are to be told before anything long
+    # Here, so that errors in the held-out data are raised before anything takes long.
     plain = replace(config.compare, whitened=False)
     commanded = all(r.command.size for r in recordings)
     heldout = (
@@ -274,7 +300,7 @@ def prepare(
     )
     if judges:
         _check_start(heldout, full)
-    begun = [beginning(recording, config.beginning) for recording in fitted]
+    begun = [beginning(recording, config.beginning, config.beginning_rule) for recording in fitted]
     early = base
     if any(short is not recording for short, recording in zip(begun, fitted, strict=True)):
         comparing = base.comparisons[0].config
@@ -299,7 +325,10 @@ def prepare(
 
 
 def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: Progress | None = None) -> Identified:
-    """The rest of `identify_parameters`: search, refine, calibrate, judge."""
+    """Search, refine, calibrate and evaluate: the part of `identify_parameters` after `prepare`.
+
+    problem: from `prepare`.  checkpoints, progress: see `identify_parameters`.
+    """
     report = progress or _silent
     config, space, full, base = problem.config, problem.space, problem.full, problem.fit
     seconds: dict[str, float] = {}
@@ -320,32 +349,34 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     began = time.monotonic()
     refined = None
     if config.refine is not None:
-        settings = config.refine if problem.engine.engine == "mjx" else replace(config.refine, **IN_C)
-        asked = [p.name for e in problem.effects for p in e.parameters if p.name in full.names]
-        begin = starts(full, space, found, asked)
-        base, refined = _refined(base, problem.early, begin, asked, config, settings, lambda p: report("refine", p))
+        settings = config.refine if problem.engine.engine == "mjx" else config.refine_in_c.applied(config.refine)
+        coefficients = [p.name for e in problem.effects for p in e.parameters if p.name in full.names]
+        begin = starts(full, space, found, coefficients, firm_grip=config.firm_grip)
+        base, refined = _refined(
+            base, problem.early, begin, coefficients, config, settings, lambda p: report("refine", p)
+        )
     best = found.best if refined is None else refined.best
-    judging = config.identifiability
-    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, judging)
+    thresholds = config.identifiability
+    full_gaussian = found.gaussian() if refined is None else posterior(refined, base.comparisons, thresholds)
     seconds["refine"] = time.monotonic() - began
 
     began = time.monotonic()
     report("judge", None)
-    judges, apart = problem.judges or problem.recordings, bool(problem.judges)
+    judges, whole_recordings = problem.judges or problem.recordings, bool(problem.judges)
     distances = heldout_distances(
-        problem.heldout, judges, problem.heldout_recordings, full.mean, best, config.worth, apart
+        problem.heldout, judges, problem.heldout_recordings, full.mean, best, config.worth, whole_recordings
     )
     seconds["judge"] = time.monotonic() - began
 
     began = time.monotonic()
     checks = {}
-    if config.checks:  # the other engine is compiled for the comparison only where this one was asked for
-        engine, compiles = problem.engine.engine, config.engine != "auto"
-        checks, off = check_solution(
-            base, problem.recordings, best, engine, problem.effects, compiles or engine == "mjx"
+    if config.checks:  # for a fit in C, MJX is compiled only if the user chose the engine
+        engine, chosen = problem.engine.engine, config.engine != "auto"
+        checks, change = check_solution(
+            base, problem.recordings, best, engine, problem.effects, chosen or engine == "mjx", config.solution
         )
         if refined is not None:
-            full_gaussian = moved_by_step(full_gaussian, step_shift(refined, off))
+            full_gaussian = moved_by_step(full_gaussian, step_shift(refined, change))
     seconds["checks"] = time.monotonic() - began
     names = [r.name for r in problem.recordings]
     return Identified(
@@ -358,7 +389,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         search=found,
         refined=refined,
         identifiability=(
-            not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, judging)
+            not_judged(full_gaussian) if refined is None else identifiability(full_gaussian, refined.prior, thresholds)
         ),
         heldout_distances=dict(zip((r.name for r in judges), distances, strict=True)),
         fit=base,
@@ -372,11 +403,11 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
 
 
 def _silent(stage: str, value: Any) -> None:
-    """No progress is shown."""
+    """Show no progress."""
 
 
 def _check_names(names: Sequence[str], judges: Sequence[str], config: IdentifyConfig) -> None:
-    """ValueError for recordings that cannot be fitted together."""
+    """Raise ValueError for recordings that cannot be fitted together."""
     both = [*names, *judges]
     if len(set(both)) != len(both):
         raise ValueError(f"recordings need different names, got {', '.join(both)}")
@@ -388,8 +419,8 @@ def _check_names(names: Sequence[str], judges: Sequence[str], config: IdentifyCo
 
 
 def _check_start(cost: Cost, space: Space) -> None:
-    """ValueError where the means cannot be simulated: nothing could be said of what the fit gained."""
-    twice = np.stack([space.mean, space.mean])  # as many rows as are judged at the end: compiled once
+    """Raise ValueError if the initial means cannot be simulated, since a fit is compared with them."""
+    twice = np.stack([space.mean, space.mean])  # two rows as in the final evaluation, which share one compilation
     for comparison, rollout in zip(cost.comparisons, cost.rollouts(twice), strict=True):
         if not np.all(rollout.finite):
             why = blow_up(cost.scene, type(rollout)(**{f: np.asarray(getattr(rollout, f))[0] for f in _FIELDS}))
@@ -409,48 +440,58 @@ def _refined(
     settings: RefineConfig,
     report: Callable[[Any], None],
 ) -> tuple[Cost, Refined]:
-    """The refinement from starts [S, F], and the cost it ended on; early: of the recordings' beginnings, or the same.
+    """Refine from starts [S, F]; return the cost with its final noise, and the result.
 
-    coefficients: of effects, by name.  The beginning of a chirp is slow and does not show what limits its end, so that
-    where some do not act, a few iterations on the whole of the recording that is fitted worst tell whether they would.
+    Recordings with repeats need one refinement.  The noise of a single repeat is estimated from residuals, so there are
+    up to three: on the beginnings of the recordings from all starts; if effects are neutral, a few iterations on the
+    full recording that fits worst, with these effects active; and on all data.  The second is needed because the
+    beginning of a chirp, for example, is slow and does not reach the limits that its end does.  The noise is estimated
+    after the search and after the first two.  It is not estimated after the last one: logs that fit well would gain
+    weight with every refinement (one fold of the XL330 went from 0.032 to 0.106 rad by it).
 
-    The noise of a single repeat is not known: it is stated from what the search, a first refinement and these
-    iterations leave unexplained.  Not from the last one too: logs that fit well would then count for ever more (one
-    fold of the XL330 fell from 0.032 to 0.106 rad by it).
+    Args:
+        base: cost of the full recordings.
+        early: cost of their beginnings, or `base`.
+        begin: [S, F] physical values.
+        coefficients: names of the effects' coefficients.
+        config: settings of the identification.
+        settings: of the refinement, for the engine.
+        report: called with the refinement's progress.
     """
 
-    def run(cost: Cost, rough: Cost | None, begin: np.ndarray, settings: RefineConfig = settings) -> Refined:
-        hypotheses, first = grip_hypotheses(cost.space), None if rough is None else rough.whitened
+    def run(cost: Cost, cheap: Cost | None, begin: np.ndarray, settings: RefineConfig = settings) -> Refined:
+        hypotheses, first = grip_hypotheses(cost.space), None if cheap is None else cheap.whitened
         return refine(cost.whitened, cost.space, begin, settings, first=first, hypotheses=hypotheses, progress=report)
 
-    whole = early is base
+    all_short = early is base
     if all(c.repeats > 1 for c in base.comparisons):
-        return base, run(base, base.first() if whole else early, begin)
-    early = early.restated(begin[0])
+        return base, run(base, base.first() if all_short else early, begin)
+    early = early.with_estimated_noise(begin[0])
     first = run(early, early.first(), begin)
-    base, count = base.restated(first.best), first.evaluations
-    # The first one has looked for other basins, and in plain C twice where nothing was found.
+    base, count = base.with_estimated_noise(first.best), first.evaluations
+    # The first refinement has searched for other basins, and in plain C has had twice the patience.
     settled = replace(settings, basin_hops=0, patience=(config.refine or settings).patience)
     if acting := with_acting(base.space, first.best, coefficients):
         worst = base.alone(int(np.argmax(base.distances(first.best[None])[0])))
         short = replace(settled, iterations=config.sorting, spreads=0, pruning_ratio=config.sorting_ratio)
         first = run(worst, None, np.stack([first.best, *acting]), short)
-        base, count = base.restated(first.best), count + first.evaluations
-    last = run(base, base.first() if whole or acting else early.restated(first.best), first.best, settled)
+        base, count = base.with_estimated_noise(first.best), count + first.evaluations
+    cheap = base.first() if all_short or acting else early.with_estimated_noise(first.best)
+    last = run(base, cheap, first.best, settled)
     return base, replace(last, evaluations=count + last.evaluations)
 
 
 def _fingerprint(
     scene: Scene, full: Space, recording: Recording, config: IdentifyConfig, effects: Sequence[Effect]
 ) -> str:
-    """All that the search's cost is made from: a search of another cost is not gone on with."""
+    """Text of all inputs of the search's cost.  A checkpoint of another cost is refused."""
     made_from = {
         "recording": recording.sha256,
         "scene": scene.sha256,
         "measured": [scene.joints, scene.command_names, scene.object_joint, scene.grip and scene.grip.fingers],
         "space": space_to_json(full),
         "engine": config.engine,
-        "beginning": config.beginning,
+        "beginning": [config.beginning, asdict(config.beginning_rule)],
         "compare": asdict(config.compare),
         "effects": [[e.name, *([p.name, p.mean, p.low, p.high] for p in e.parameters)] for e in effects],
     }
@@ -458,19 +499,25 @@ def _fingerprint(
 
 
 def _possible(scene: Scene, gaussian: Gaussian, seed: int, count: int) -> np.ndarray:
-    """[count, D] draws with inertias that bodies can have."""
+    """[count, D] draws with physically possible inertias."""
     rng = np.random.default_rng(seed)
     return possible_draws(scene, gaussian.space, lambda n: gaussian.sample(rng, n), count)
 
 
 def cost_samples(found: Identified, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Costs on held-out repeats of samples from the initial and from the fitted Gaussian, `count` of them at most.
+    """Return costs on held-out data of draws from the initial and from the fitted Gaussian.
 
-    initial, fitted: [n, D] values; initial_cost, fitted_cost: [n] N m, failed replays carry their penalty;
-    names: [D] of the parameters.
+    Args:
+        found: the result of an identification.
+        count: number of draws, at most.
+        seed: of the draws.
+
+    Returns:
+        initial, fitted: [n, D] values.  initial_cost, fitted_cost: [n] N m, with the penalty of failed replays.
+        names: [D] of the parameters.
     """
     steps = 2 * sum(len(drive.time) for drive in found.heldout.drives)
-    count = min(count, max(FEWEST, found.config.sample_steps // steps))
+    count = min(count, max(found.config.least_samples, found.config.sample_steps // steps))
     first, last = (_possible(found.scene, g, seed, count) for g in (prior(found.space), found.full_gaussian))
     return {
         "initial": first,

@@ -1,8 +1,6 @@
-"""A run's folder: everything an identification found, as JSON, npz, CSV, MJCF. No pickle.
+"""The folder of a run: the result of an identification as JSON, npz, CSV and MJCF.
 
-config.json, fit.json, gaussian.json, history.npz/.csv, samples.csv, traces.npz, distribution.npz,
-correlation.npz, fitted.xml, fitted.json, apply_fit.py; docs/results-folder.md lists them, `report` turns them into
-a page.
+docs/results-folder.md lists the files.  `report` makes a page of them.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from droid_jax.identify.gaussian import prior
 from droid_jax.identify.holdout import NOISE_UNITS, HeldoutDistance
 from droid_jax.identify.neutral_result import write_neutral
 from droid_jax.identify.pipeline import Identified
-from droid_jax.identify.solution_checks import solution_notes
+from droid_jax.identify.solution_checks import SolutionCheck, solution_notes
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.mjcf import unwritten
 from droid_jax.model.parameters import Space
@@ -59,12 +57,17 @@ def write_run(
     notes: Iterable[str] = (),
     findings: Iterable[Finding] = (),
 ) -> None:
-    """Write all files of a run into `folder` (see the module's text).
+    """Write all files of a run into a folder.
 
-    truth: hidden values where they are known (the synthetic robot); samples: draws them (see `cost_samples`), once
-      the fit itself is on disk.
-    effects: that were in the model beside what the scene has.
-    findings: what the checks of the recordings found.
+    Args:
+        folder: to write to.
+        found: the result of the identification.
+        config: content of config.json.
+        truth: parameter values of the synthetic robot, where they are known.
+        samples: returns draws and their costs (`pipeline.cost_samples`); called once the fit is on disk.
+        effects: in the model in addition to the scene.
+        notes: sentences for the report.
+        findings: of the checks of the recordings.
     """
     notes = [*notes, *solution_notes(found.checks, found.scene.name)]
     error = write_neutral(
@@ -84,11 +87,14 @@ def write_run(
         drawn = samples()
         write_npz(folder / DISTRIBUTION, drawn)
         write_csv(folder / SAMPLES, found.space.names, drawn["fitted"].tolist())
-    write_json(folder / CONFIG, dict(config))  # last: its presence says that the run is whole
+    write_json(folder / CONFIG, dict(config))  # last: its presence means that the run is complete
 
 
 def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) -> dict[str, Any]:
-    """The fit as plain data: parameters with intervals, torque distances, costs, why it stopped."""
+    """Return the content of fit.json: parameters with intervals, distances, costs, stop criteria.
+
+    truth: see `write_run`.  notes: sentences for the report.
+    """
     low, high = found.full_gaussian.interval(0.9)
     initial = np.stack(prior(found.full).interval(0.9), axis=1)
     mean, std = found.full_gaussian.physical_mean, found.full_gaussian.physical_std
@@ -96,7 +102,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
     x, initial_x = (found.full.to_search(v).tolist() for v in (found.best, found.full.mean))
     parameters = []
     for i, p in enumerate(found.full.parameters):
-        tells = found.identifiability[i]
+        verdict = found.identifiability[i]
         parameters.append(
             {
                 "name": p.name,
@@ -112,21 +118,21 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
                 "mean": float(mean[i]),
                 "std": float(std[i]),
                 "interval": [float(low[i]), float(high[i])],
-                "identifiable": tells.identifiable,
-                "reason": tells.reason,
-                "moved": finite(x[i] - initial_x[i] if math.isnan(tells.moved) else tells.moved),
+                "identifiable": verdict.identifiable,
+                "reason": verdict.reason,
+                "moved": finite(x[i] - initial_x[i] if math.isnan(verdict.moved) else verdict.moved),
                 "truth": truth.get(p.name),
                 "on_bound": p.name in bound,
-                "partners": [{"name": n, "correlation": c} for n, c in tells.partners],
+                "partners": [{"name": n, "correlation": c} for n, c in verdict.partners],
             }
         )
     costs = found.fit(np.stack([found.start, found.best]))
     floors: list[Any] = [g.noise_floor for g in found.heldout_distances.values()]
     comparison = found.fit.comparisons[0]
-    whitened = comparison.config.whitened  # the distances' floors are in the unit of the channel
-    judges = list(found.heldout_distances.values())
-    unit = judges[0].unit
-    fitted = judges[0].judged != "recordings"  # floors of other recordings are none of this cost
+    whitened = comparison.config.whitened  # noise floors are in the unit of the channel
+    distances = list(found.heldout_distances.values())
+    unit = distances[0].unit
+    same_recordings = distances[0].judged != "recordings"  # floors of other recordings do not apply to this cost
     evaluations = found.search.evaluations + (found.refined.evaluations if found.refined else 0)
     return {
         "format": FORMAT,
@@ -135,7 +141,7 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "cost": {
             "initial": float(costs[0]),
             "best": float(costs[1]),
-            "noise_floor": float(np.mean(floors)) if fitted and not whitened and None not in floors else None,
+            "noise_floor": float(np.mean(floors)) if same_recordings and not whitened and None not in floors else None,
             "unit": NOISE_UNITS if whitened else unit,
         },
         "heldout_distances": {
@@ -154,15 +160,18 @@ def fit_json(found: Identified, truth: Mapping[str, float], notes: list[str]) ->
         "mjcf_lacks": list(unwritten(found.scene, found.full)),
         "notes": notes,
         "config": config_json(found.config),
-        "checks": {
-            name: {**asdict(check), "too_coarse": check.too_coarse, "engines_differ": check.engines_differ}
-            for name, check in found.checks.items()
-        },
+        "checks": {name: _check_json(check) for name, check in found.checks.items()},
     }
 
 
+def _check_json(check: SolutionCheck) -> dict[str, Any]:
+    """A check with its verdicts; the settings are under `config`."""
+    measured = {name: value for name, value in asdict(check).items() if name != "config"}
+    return {**measured, "too_coarse": check.too_coarse, "engines_differ": check.engines_differ}
+
+
 def per_joint(distance: HeldoutDistance) -> dict[str, list[float | None]]:
-    """Numbers of each joint; None where the simulation of what judges blew up."""
+    """Return the numbers of each joint, None where the simulation of the held-out data blew up."""
     each = {"per_joint_before": distance.per_joint_before, "per_joint_after": distance.per_joint_after}
     return {name: [finite(v) for v in values] for name, values in each.items()}
 
@@ -186,30 +195,31 @@ def _write_history(folder: Path, found: Identified) -> None:
 
 
 def _physical_deviation(space: Space, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """[G, D] half the spread of one search deviation to each side, physical units."""
+    """[G, D] half the distance in physical units of the points one search deviation above and below the mean."""
     x = space.to_search(mean)
     return 0.5 * (space.from_search(x + std) - space.from_search(x - std))
 
 
 def traces(found: Identified) -> dict[str, np.ndarray]:
-    """Smoothed channels of each recording that judges, before and after the fit: the leading one under the recording's
-    name, the others under recording/channel.
+    """Return the smoothed channels of the held-out data, before and after the fit.
+
+    The leading channel is under the recording's name, the others are under recording/channel.
     """
     both, rollouts = np.stack([found.start, found.best]), found.heldout.rollouts(np.stack([found.start, found.best]))
     out: dict[str, np.ndarray] = {}
     for comparison, pair in zip(found.heldout.comparisons, rollouts, strict=True):
         rows = [sample_of(pair, row) for row in range(len(both))]
         for channel in comparison.channels:
-            leads = channel is comparison.leading
-            place = comparison.name if leads else f"{comparison.name}/{channel.name}"
+            is_leading = channel is comparison.leading
+            prefix = comparison.name if is_leading else f"{comparison.name}/{channel.name}"
             lines = [np.asarray(comparison.smoothed(row, channel.name)) for row in rows]
-            out |= {f"{place}/{key}": value for key, value in _of_channel(found.scene, channel, *lines).items()}
+            out |= {f"{prefix}/{key}": value for key, value in _of_channel(found.scene, channel, *lines).items()}
         out[f"{comparison.name}/phases"] = np.array(json.dumps([asdict(phase) for phase in comparison.phases]))
     return out
 
 
 def _of_channel(scene: Scene, channel: Measured, before: np.ndarray, after: np.ndarray) -> dict[str, np.ndarray]:
-    """A channel measured, with the spread of its repeats, and simulated [K, C]; NaN where nothing was measured."""
+    """A measured channel with the spread of its repeats, and simulated [K, C]; NaN where nothing was measured."""
     repeats = channel.noise.repeats
     joints = [scene.joints[c] for c in channel.columns]
     lines = {

@@ -1,11 +1,11 @@
 """CMA-ES over the parameters of a space: the search of the paper's section III-B.
 
-Each generation draws a population from the current Gaussian, asks the cost of every row in one
-batch, and moves the Gaussian towards the best rows (`identify.cma`).
+Each generation draws a population from the current Gaussian, evaluates the cost of all rows in one batch, and moves the
+Gaussian towards the best rows (`identify.cma`).
 
-The search moves in search coordinates x (one unit is about one prior deviation), the cost sees
-physical values.  Independent restarts are rows of the same batch.  Everything random comes from
-fold_in(key(seed), generation), so a resumed search repeats an uninterrupted one bit for bit.
+The search works in search coordinates x, where one unit is about one prior deviation.  The cost receives physical
+values.  Independent restarts are rows of the same batch.  All randomness comes from fold_in(key(seed), generation), so
+a resumed search repeats an uninterrupted one bit for bit.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, flag, number, one_of, optional, whole
+from droid_jax.arguments import check_fields, flag, number, optional, whole
 from droid_jax.distributed import agreed
 from droid_jax.identify.cma import Strategy, recombination
-from droid_jax.identify.fit import REASONS, CmaState, Fit, History, Restart, SearchProgress, on_bound
+from droid_jax.identify.fit import STOP_REASONS, CmaState, Fit, History, SearchProgress, on_bound
 from droid_jax.identify.gaussian import space_to_json
 from droid_jax.model.parameters import Space
 
@@ -35,33 +35,30 @@ Cost = Callable[[np.ndarray], Any]  # [rows, D] float64 physical values -> [rows
 
 
 class NotReplayed(ValueError):
-    """No replay gave numbers where a search or a refinement needed some."""
+    """All replays that a search or a refinement needed blew up."""
 
 
 @dataclass(frozen=True)
 class CmaConfig:
-    """Settings of a search; the defaults are the paper's population with stated stops.
+    """Settings of a search; the defaults are the paper's population with stop criteria.
 
     population: rows per generation and restart.
-    parents:    rows with positive weight; None takes half of the population, CMA-ES's own default.
-    generations: most generations.
-    restarts:   independent searches, evaluated in one batch of restarts * population rows; restart r
-                draws what a single search with seed + r would draw.
-    sigma:      initial step in search coordinates; 1 starts from the prior.
-    bounds:     "resample" redraws rows in which a linearly scaled parameter is out of bounds and clips
-                what is still outside after `redraws` draws, and mirrors log-scaled ones at their bounds; at the
-                end the best is asked for once more with what lies near a bound (`near_bound`) on it;
-                "clip" clips both, which leads nowhere where several optima lie beyond their bounds.
-    redraws:    draws per row among which one inside the bounds is looked for.
-    near_bound: search coordinates, one prior deviation: so near to a bound the best is tried on it.
-    active:     negative weights for the worst rows; None: only when `parents` is None.
-    tol_cost:   a restart stops when its best cost fell by less than this share over `patience`
-                generations; 0 never.
-    patience:   generations, see tol_cost.
-    tol_sigma:  a restart stops when the longest axis of its Gaussian (a deviation, in search
-                coordinates) is below this; 0 never.  float32 resolves about 1e-5.
+    parents: rows with positive weight; None takes half of the population, the default of CMA-ES.
+    generations: at most.
+    restarts: independent searches, evaluated in one batch of restarts * population rows.  Restart r draws the same rows
+      as a single search with seed + r.
+    sigma: initial step in search coordinates; 1 starts from the prior.
+    redraws: draws per row, of which the first inside the bounds is taken; a row that is still outside is clipped.  It
+      applies to linearly scaled parameters.  Log-scaled ones are mirrored at their bounds.
+    near_bound: search coordinates.  After the last generation the best values closer than this to a bound are also
+      evaluated on it.  The default is one prior deviation.
+    active: negative weights for the worst rows; None: only if `parents` is None.
+    tol_cost: a restart stops if its best cost fell by less than this share over `patience` generations; 0 never.
+    patience: generations, see `tol_cost`.
+    tol_sigma: a restart stops if the longest axis of its Gaussian (a deviation, in search coordinates) is below this; 0
+      never.  float32 resolves about 1e-5.
     max_seconds: stop after this many seconds of wall time, resumed parts included; None never.
-    seed:       of all randomness.
+    seed: of all randomness.
     checkpoint_every: generations between checkpoints.
     """
 
@@ -70,7 +67,7 @@ class CmaConfig:
     generations: int = 100
     restarts: int = 1
     sigma: float = 1.0
-    bounds: Literal["resample", "clip"] = "resample"
+
     redraws: int = 64
     near_bound: float = 1.0
     active: bool | None = None
@@ -91,7 +88,6 @@ class CmaConfig:
             population=partial(whole, least=2),
             parents=optional(whole),
             sigma=partial(number, above=0),
-            bounds=partial(one_of, valid=("resample", "clip")),
             active=optional(flag),
             max_seconds=optional(partial(number, above=0)),
             seed=whole,
@@ -119,18 +115,26 @@ def cma_search(
     fingerprint: str = "",
     progress: Callable[[SearchProgress], None] | None = None,
 ) -> Fit:
-    """Minimise cost over a space.
+    """Minimise a cost over a space.
 
-    cost:        [restarts * population, D] float64 physical values inside the bounds -> [same] costs on
-                 host or device; NaN and infinite costs are failed rows, never chosen as parents.
-    start:       [D] or [restarts, D] physical values to start from; None starts at the prior mean.
-    checkpoint_dir: saves there and resumes from the newest whole checkpoint; a finished search can be
-                 continued with more generations.
-    fingerprint: says what the cost was made from (recording, scene, ...); a checkpoint made with another
-                 space, configuration, start or fingerprint is refused.
+    Args:
+        cost: [restarts * population, D] float64 physical values inside the bounds -> costs of the rows, on host or
+            device.  NaN and infinite costs are failed rows, which are never chosen as parents.
+        space: meaning of the D entries.
+        config: settings.
+        start: [D] or [restarts, D] physical values to start from; None for the prior mean.
+        checkpoint_dir: folder to save to, and to resume from its newest complete checkpoint.  A finished search can be
+            continued with more generations.
+        fingerprint: text that identifies the cost (recording, scene, ...).  A checkpoint of another space,
+            configuration, start or fingerprint is refused.
+        progress: called after every generation.
 
-    Raises NotReplayed, a ValueError, when a whole generation failed; ValueError on a cost of the wrong shape, a start
-    out of bounds, or somebody else's checkpoint.
+    Returns:
+        The best values and the final Gaussian, of the restart with the lowest cost.
+
+    Raises:
+        NotReplayed: all rows of a generation failed; a ValueError.
+        ValueError: a cost of the wrong shape, a start out of bounds, or a checkpoint of another search.
     """
     strategy = _strategy(space, config)
     centre = _start(space, config, start)
@@ -144,27 +148,25 @@ def cma_search(
                 checkpoints.save(run.generation, run.tree())
             if progress:
                 progress(_progress(run, config))
-        asked = _try_bounds(run, cost, space, config)
-    return _fit(run, space, config, asked)
+        extra_rows = _try_bounds(run, cost, space, config)
+    return _fit(run, space, config, extra_rows)
 
 
 def _strategy(space: Space, config: CmaConfig) -> Strategy:
-    """The CMA-ES that a configuration asks for."""
+    """The CMA-ES of a configuration."""
     active = config.parents is None if config.active is None else config.active
     weights = recombination(config.population, config.elite, len(space), active)
     seeds = range(config.seed, config.seed + config.restarts)
-    redraws = config.redraws if config.bounds == "resample" else 0
-    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=redraws)
+    return Strategy(space, weights, sigma=config.sigma, seeds=seeds, redraws=config.redraws)
 
 
 def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: CmaConfig) -> None:
-    """One generation of every restart: draw, evaluate, update, record, judge."""
+    """One generation of every restart: draw, evaluate, update, record, check the stop criteria."""
     started = time.perf_counter()
     space = strategy.space
     running = run.stopped == 0
     x, state = strategy.ask(run.state, run.generation)  # [R, P, D]
-    drawn = np.asarray(x, np.float64)
-    values = space.from_search(drawn if config.bounds == "clip" else mirrored(space, drawn))
+    values = space.from_search(mirrored(space, np.asarray(x, np.float64)))
     costs = _evaluate(cost, values)  # [R, P]
     if not np.isfinite(costs[running]).any():
         raise NotReplayed(
@@ -174,56 +176,55 @@ def _generation(run: CmaState, cost: Cost, strategy: Strategy, config: CmaConfig
         )
     run.failed += int((~np.isfinite(costs)).sum())
     run.state = strategy.tell(state, x, costs, running)
-    run.keep_best(values, costs, running)
+    run.update_best(values, costs, running)
     run.generation += 1
     run.ended[running] = run.generation
     run.record(costs, space.from_search(np.asarray(run.state.mean, np.float64)))
     run.records["seconds"].append(np.full(config.restarts, time.perf_counter() - started))
-    _judge(run, config)
+    _check_stop(run, config)
 
 
 def mirrored(space: Space, x: np.ndarray) -> np.ndarray:
-    """Search coordinates [..., D] with what lies beyond a bound mirrored at it, and held at the other one.
+    """Return search coordinates [..., D] with values beyond a bound mirrored at it, and clipped at the other bound.
 
-    The algebra is told the raw draw: were draws beyond a bound evaluated on it, all of them would look alike, selection
-    would pull outwards, and the step size would grow without end where the optimum lies at or beyond a bound.
+    The update of CMA-ES uses the raw draws.  If draws beyond a bound were clipped instead, all of them would cost the
+    same.  Selection would then pull outwards, and the step size would grow without limit where the optimum lies at or
+    beyond a bound.
     """
     low, high = space.to_search(space.low), space.to_search(space.high)
     return np.clip(np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x)), low, high)
 
 
 def _try_bounds(run: CmaState, cost: Cost, space: Space, config: CmaConfig) -> int:
-    """Ask once more for every restart's best, moved onto bounds it lies near; how many rows were asked.
+    """Evaluate every restart's best once more, moved onto the bounds that it is near; return the number of rows.
 
-    Mirrored draws come near a bound and never lie on it.  A row that costs no more becomes the best.  Nothing of this
-    is in a checkpoint, so that a search that is continued goes on as it would have.
+    Mirrored draws come near a bound but never lie on it.  A row that costs no more becomes the best.  Checkpoints do
+    not hold this step, so a search that is continued is not changed by it.
     """
-    if config.bounds == "clip":
-        return 0
-    known = np.isfinite(run.best_cost)  # a restart whose every row blew up has no best
-    bests = np.where(known[:, None], run.best, space.mean)
+    has_best = np.isfinite(run.best_cost)  # False for a restart whose rows all blew up
+    bests = np.where(has_best[:, None], run.best, space.mean)
     values = np.stack(
         [_moved_onto_bounds(space, best, config.population, config.near_bound) for best in bests]
     )  # [R, P, D]
-    if (values == bests[:, None])[known].all():
+    if (values == bests[:, None])[has_best].all():
         return 0
-    run.keep_best(values, _evaluate(cost, values), known, ties=True)
+    run.update_best(values, _evaluate(cost, values), has_best, ties=True)
     return values.shape[0] * values.shape[1]
 
 
 def _moved_onto_bounds(space: Space, best: np.ndarray, rows: int, near: float) -> np.ndarray:
-    """Values [rows, D]: the best [D] with all its near coordinates on their bounds, then with ever fewer."""
+    """Values [rows, D]: the best [D] with all coordinates that are near a bound on it, then with ever fewer of them."""
     x, low, high = (space.to_search(values) for values in (best, space.low, space.high))
-    gap = np.minimum(x - low, high - x)
+    distance = np.minimum(x - low, high - x)
     values = np.tile(best, (rows, 1))
-    farthest = [i for i in np.argsort(-gap) if gap[i] <= near]
-    for k, i in enumerate(farthest[-rows:], start=1):
-        values[:k, i] = (space.low if x[i] - low[i] == gap[i] else space.high)[i]
+    farthest_first = [i for i in np.argsort(-distance) if distance[i] <= near]
+    for k, i in enumerate(farthest_first[-rows:], start=1):
+        values[:k, i] = (space.low if x[i] - low[i] == distance[i] else space.high)[i]
     return values
 
 
 def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
-    """Costs [R, P] float64 of values [R, P, D] in one batch; +inf where NaN or infinite."""
+    """Costs [R, P] float64 of values [R, P, D], evaluated in one batch; +inf where NaN or infinite."""
     rows = values.reshape(-1, values.shape[-1])
     costs = np.asarray(cost(rows), np.float64)
     if costs.shape != rows.shape[:1]:
@@ -231,8 +232,8 @@ def _evaluate(cost: Cost, values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(costs), costs, np.inf).reshape(values.shape[:2])
 
 
-def _judge(run: CmaState, config: CmaConfig) -> None:
-    """Mark the restarts that have converged; a marked one stays as it is from then on."""
+def _check_stop(run: CmaState, config: CmaConfig) -> None:
+    """Mark the restarts that have converged; a marked one does not change any more."""
     widest = np.sqrt(np.linalg.eigvalsh(run.cov)[:, -1])  # [R]
     narrow = widest < config.tol_sigma
     stalled = np.zeros_like(narrow)
@@ -241,32 +242,32 @@ def _judge(run: CmaState, config: CmaConfig) -> None:
         with np.errstate(invalid="ignore"):  # inf - inf while a restart has not found a finite row
             stalled = before - run.best_cost < config.tol_cost * np.abs(before)
     running = run.stopped == 0
-    run.stopped[running & stalled] = REASONS.index("tol_cost")
-    run.stopped[running & narrow] = REASONS.index("tol_sigma")
+    run.stopped[running & stalled] = STOP_REASONS.index("tol_cost")
+    run.stopped[running & narrow] = STOP_REASONS.index("tol_sigma")
 
 
 def _unfinished(run: CmaState, config: CmaConfig) -> bool:
-    """Whether another generation is due."""
+    """Whether another generation follows."""
     in_time = config.max_seconds is None or agreed(run.seconds < config.max_seconds)
     return bool((run.stopped == 0).any()) and run.generation < config.generations and in_time
 
 
 def _progress(run: CmaState, config: CmaConfig) -> SearchProgress:
-    """Numbers for a display; the pace is the median of ten generations, so that compilation drops out."""
+    """Numbers for a display.  The median over ten generations is the pace, which excludes the compilation."""
     pace = float(np.median([s[0] for s in run.records["seconds"][-10:]]))
-    left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
+    seconds_left = pace * (config.generations - run.generation) if _unfinished(run, config) else 0.0
     if config.max_seconds is not None:
-        left = min(left, max(0.0, config.max_seconds - run.seconds))
-    leader = int(np.argmin(run.best_cost))
+        seconds_left = min(seconds_left, max(0.0, config.max_seconds - run.seconds))
+    best = int(np.argmin(run.best_cost))
     median = float(np.min(run.records["median_cost"][-1][run.ended == run.generation]))
-    sigma = float(run.records["sigma"][-1][leader])
+    sigma = float(run.records["sigma"][-1][best])
     return SearchProgress(
-        run.generation, config.generations, float(run.best_cost[leader]), median, sigma, run.seconds, left
+        run.generation, config.generations, float(run.best_cost[best]), median, sigma, run.seconds, seconds_left
     )
 
 
 def _history(run: CmaState, restart: int) -> History:
-    """One restart's own rows of the records, as long as it ran."""
+    """The records of one restart, over the generations that it ran."""
     ended = int(run.ended[restart])
     records: dict[str, np.ndarray] = {
         name: np.stack([each[restart] for each in rows[:ended]]) for name, rows in run.records.items()
@@ -274,40 +275,26 @@ def _history(run: CmaState, restart: int) -> History:
     return History(**records)
 
 
-def _fit(run: CmaState, space: Space, config: CmaConfig, asked: int) -> Fit:
-    """The result, led by the restart with the lowest cost; `asked` rows came after the generations."""
+def _fit(run: CmaState, space: Space, config: CmaConfig, extra_rows: int) -> Fit:
+    """The result of the restart with the lowest cost; extra_rows: evaluated after the last generation."""
     overall = "max_seconds" if run.generation < config.generations else "generations"
-    covs, means = run.cov, run.records["mean"][-1]
-    restarts = tuple(
-        Restart(
-            seed=config.seed + r,
-            best=run.best[r],
-            best_cost=float(run.best_cost[r]),
-            mean=means[r],
-            cov=covs[r],
-            stop=REASONS[int(run.stopped[r])] or overall,
-            history=_history(run, r),
-        )
-        for r in range(config.restarts)
-    )
-    winner = min(restarts, key=lambda r: r.best_cost)
+    r = int(np.argmin(run.best_cost))
     return Fit(
         space=space,
-        best=winner.best,
-        best_cost=winner.best_cost,
-        mean=winner.mean,
-        cov=winner.cov,
-        history=winner.history,
-        evaluations=run.generation * config.restarts * config.population + asked,
+        best=run.best[r],
+        best_cost=float(run.best_cost[r]),
+        mean=run.records["mean"][-1][r],
+        cov=run.cov[r],
+        history=_history(run, r),
+        evaluations=run.generation * config.restarts * config.population + extra_rows,
         failed=run.failed,
-        stop=winner.stop,
-        on_bound=on_bound(space, winner.best),
-        restarts=restarts,
+        stop=STOP_REASONS[int(run.stopped[r])] or overall,
+        on_bound=on_bound(space, run.best[r]),
     )
 
 
 def _start(space: Space, config: CmaConfig, start: np.ndarray | None) -> np.ndarray:
-    """[R, D] physical values that the restarts begin at."""
+    """[R, D] physical values of the restarts' starts."""
     values = space.check(space.mean if start is None else start)
     if values.shape not in ((len(space),), (config.restarts, len(space))):
         raise ValueError(
@@ -317,27 +304,27 @@ def _start(space: Space, config: CmaConfig, start: np.ndarray | None) -> np.ndar
 
 
 def _checkpoints(folder: Path | None, space: Space, config: CmaConfig, centre: np.ndarray, fingerprint: str) -> Any:
-    """Checkpoints of this search as a context manager; of None when no folder is given."""
+    """A context manager of the checkpoints of this search, or of None if there is no folder."""
     if folder is None:
         return nullcontext(None)
     from droid_jax.identify.checkpoints import Checkpoints  # only here: it imports orbax
 
-    # what may change between two parts of one search without changing its path
-    free = ("generations", "max_seconds", "checkpoint_every")
+    # settings that do not change a search, and may differ when it is resumed
+    may_differ = ("generations", "max_seconds", "checkpoint_every")
     texts = {
         "fingerprint": fingerprint,
         "space": json.dumps(space_to_json(space)),
-        "config": json.dumps({k: v for k, v in asdict(config).items() if k not in free}),
+        "config": json.dumps({k: v for k, v in asdict(config).items() if k not in may_differ}),
         "start": json.dumps(centre.tolist()),
     }
     return Checkpoints(folder, fingerprint=texts)
 
 
 def _restored(checkpoints: Checkpoints | None, strategy: Strategy, centre: np.ndarray) -> CmaState | None:
-    """The search as its newest whole checkpoint left it, or None."""
-    found = checkpoints.restore() if checkpoints else None
-    if found is None:
+    """The search at its newest complete checkpoint, or None."""
+    restored = checkpoints.restore() if checkpoints else None
+    if restored is None:
         return None
-    generation, tree = found
+    generation, tree = restored
     state = strategy.put_state(strategy.init(centre), tree["state"])
     return CmaState.of_tree(generation, tree, state)

@@ -1,4 +1,4 @@
-"""What is rehearsed: recordings as they were measured, or what the replay and a noise make of their commands."""
+"""Recordings to rehearse: as they were measured, or simulated from their commands with a stated noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
-from droid_jax.rehearsal.linear import RehearsalConfig
+from droid_jax.rehearsal.linear import DEFAULT_REHEARSAL, RehearsalConfig
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 from droid_jax.simulate.replay import Drive
@@ -28,20 +28,17 @@ from droid_jax.simulate.servo_gains import scale_gains, servo_factors
 from droid_jax.synthetic.hidden_effects import HIDDEN, LIBRARY, ON_HINGE, Applied, check, record_hidden
 from droid_jax.synthetic.robot import SyntheticRobotConfig
 
-RATE = 200.0  # Hz, of channels that nobody measured
-FINE_RATE = 1000.0  # Hz, of what the synthetic robot hands on before it is put onto the recording's clocks
-SMOOTH = 0.1  # of the assumed noise, below which a channel of one repeat is taken to be no measurement
-ColumnNoise = tuple[str, str, str, float, str]  # channel, column, unit, deviation of one sample, where it comes from
+ColumnNoise = tuple[str, str, str, float, str]  # channel, column, unit, standard deviation of one sample, its source
 
 
 @dataclass(frozen=True)
 class RehearsalPlan:
-    """What is rehearsed.
+    """What is stated instead of measured.
 
-    repeats: of each recording; None: as many as it holds.  noise: channel -> deviation of one sample, in its unit,
-    stated.  values: parameter -> value where it stands; others at their means.  channels: to compare; None: the
-    search's own choice.
-    simulated: replace what was measured by what the replay and the noise make of the commands.
+    repeats: of each recording; None for the recording's own number.
+    noise: channel -> standard deviation of one sample, in its unit; None if it is not stated.
+    values: parameter -> value; the others have their means.
+    channels: to compare; None for the search's choice.
     """
 
     repeats: int | None = None
@@ -51,7 +48,7 @@ class RehearsalPlan:
 
     @property
     def simulated(self) -> bool:
-        """Whether what was measured is replaced by what the replay and the noise make of the commands."""
+        """Whether the measurement is replaced by a simulation of the commands with noise."""
         return self.repeats is not None or self.noise is not None
 
 
@@ -64,10 +61,21 @@ def simulated_channels(
     config: DiscrepancyConfig,
     engine: str = "mjx",
 ) -> Rollout:
-    """What the replay makes of a recording's commands at values [D], without noise: one sample, host arrays [T, ...].
+    """Simulate a recording's commands without noise; return one sample, host arrays [T, ...].
 
-    Its times count from the recording's first command.  engine: "mjx", or "mujoco" for plain C (ValueError where it
-    lacks something).
+    Its times begin at 0 with the recording's first command.
+
+    Args:
+        scene: the robot.
+        space: meaning of the values.
+        effects: in the model.
+        recording: with commands.
+        values: [D].
+        config: of the search.
+        engine: "mjx", or "mujoco" for plain C.
+
+    Raises:
+        ValueError: the simulation blows up, or plain C does not support the model.
     """
     drive = followed(scene, recording, config.compare)
     replay = compiled_replay(engine, scene, space, drive, effects)
@@ -81,19 +89,19 @@ def simulated_channels(
 
 
 def sample_noise(channel: Channel) -> np.ndarray:
-    """[C] deviation of a measured channel from row to row, as if it were white: of its second differences."""
+    """Return the standard deviation [C] of a channel's noise, from its second differences as if it were white."""
     second = np.diff(np.where(channel.mask, channel.values, np.nan), n=2, axis=1)
-    spread = np.nanmedian(np.abs(second).reshape(-1, second.shape[-1]), axis=0)
-    return 1.4826 * np.nan_to_num(spread) / np.sqrt(6.0)
+    median = np.nanmedian(np.abs(second).reshape(-1, second.shape[-1]), axis=0)
+    return 1.4826 * np.nan_to_num(median) / np.sqrt(6.0)
 
 
 def scattered(channel: Channel) -> np.ndarray | None:
-    """[N, T, C] deviations of the repeats from their mean where all was measured; None of one repeat."""
+    """Return deviations [N, T, C] of the repeats from their mean, 0 where not measured; None for one repeat."""
     if len(channel.values) < 2:
         return None
     values = np.where(channel.mask, channel.values, np.nan)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # instants that nobody measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # instants that no repeat measured
         return np.nan_to_num(values - np.nanmean(values, axis=0))
 
 
@@ -101,21 +109,27 @@ def noisy(
     clean: np.ndarray,
     repeats: int,
     deviation: np.ndarray,
-    apart: np.ndarray | None,
+    deviations: np.ndarray | None,
     rng: np.random.Generator,
     mix: np.ndarray,
 ) -> np.ndarray:
-    """[N, T, C] a trace [T, C] with noise: what measured repeats [n, T, C] are apart, mixed anew, or white.
+    """Return a trace with noise in N repeats, [N, T, C].
 
-    mix: [N, n] of normal numbers; the mixture has the covariance of the measured repeats.
+    Args:
+        clean: [T, C] trace without noise.
+        repeats: N.
+        deviation: [C] standard deviation of white noise, where `deviations` is None.
+        deviations: [n, T, C] of measured repeats from their mean, which are mixed at random; or None.
+        rng: source of the white noise.
+        mix: [N, n] standard normal numbers; the mixture has the covariance of the measured repeats.
     """
-    if apart is not None:
-        return clean + np.einsum("nm,mtc->ntc", mix, apart) / np.sqrt(max(len(apart) - 1, 1))
+    if deviations is not None:
+        return clean + np.einsum("nm,mtc->ntc", mix, deviations) / np.sqrt(max(len(deviations) - 1, 1))
     return clean + deviation * rng.normal(size=(repeats, *clean.shape))
 
 
 def unit_of_simulated(scene: Scene, name: str, columns: Sequence[str]) -> str:
-    """Of a channel that nobody measured."""
+    """Return the unit of a channel that was not measured."""
     if name == "torque":
         return scene.torque_unit(columns)
     return (
@@ -126,27 +140,36 @@ def unit_of_simulated(scene: Scene, name: str, columns: Sequence[str]) -> str:
 
 
 def possible_channels(scene: Scene, recording: Recording) -> tuple[str, ...]:
-    """What a replay of a recording could be compared in."""
+    """Return the channels of a recording that its replay produces, whether they were measured or not."""
     if not recording.command.size:
         return ("torque",)
-    seen = scene.object_joint is not None and scene.object_joint not in scene.joints
-    return tuple(name for name in SIMULATED if name != "object_angle" or seen)
+    has_object = scene.object_joint is not None and scene.object_joint not in scene.joints
+    return tuple(name for name in SIMULATED if name != "object_angle" or has_object)
 
 
 def column_noise(
-    known: Channel | None, columns: int, stated: float | None, assumed: float
+    measured: Channel | None, columns: int, stated: float | None, assumed: float, smooth: float
 ) -> tuple[np.ndarray, str, np.ndarray | None]:
-    """[C] deviation of one sample, where it comes from, and [N, T, C] how repeats scatter where that is known.
+    """Return the standard deviation [C] of one sample, its source, and deviations [N, T, C] of the repeats or None.
 
-    Stated before measured: by the repeats, else from row to row, unless a channel is as smooth as a command.
+    A stated noise has priority, then the scatter of the repeats, then second differences of one repeat, then the
+    assumed noise.
+
+    Args:
+        measured: the channel, or None if it was not measured.
+        columns: C.
+        stated: standard deviation, or None.
+        assumed: standard deviation.
+        smooth: share of `assumed`; a channel with less noise in its second differences is taken for a command.
     """
     if stated is not None:
         return np.full(columns, stated), "stated", None
-    apart = None if known is None else scattered(known)
-    if apart is not None:
-        return apart.std(axis=(0, 1)) * np.sqrt(len(apart) / (len(apart) - 1)), "repeats", apart
-    deviation = np.zeros(columns) if known is None else sample_noise(known)
-    if deviation.min() > SMOOTH * assumed:
+    deviations = None if measured is None else scattered(measured)
+    if deviations is not None:
+        count = len(deviations)
+        return deviations.std(axis=(0, 1)) * np.sqrt(count / (count - 1)), "repeats", deviations
+    deviation = np.zeros(columns) if measured is None else sample_noise(measured)
+    if deviation.min() > smooth * assumed:
         return deviation, "log, from row to row", None
     return np.full(columns, assumed), "assumed", None
 
@@ -154,32 +177,40 @@ def column_noise(
 def planned_recording(
     scene: Scene, recording: Recording, rollout: Rollout, plan: RehearsalPlan, config: RehearsalConfig, seed: int
 ) -> tuple[Recording, list[ColumnNoise]]:
-    """A recording with every channel that a replay has, and the noise of each column.
+    """Return a recording with every channel that a replay produces, and the noise of each column.
 
-    What was measured stays, unless the plan says otherwise; what was not is simulated, with the noise that was stated,
-    measured or assumed.
+    Measured channels are unchanged unless the plan replaces them.  The others are simulated, with the stated, measured
+    or assumed noise.
+
+    Args:
+        scene: the robot.
+        recording: as measured.
+        rollout: simulation of its commands, of one sample.
+        plan: what replaces the measurement.
+        config: assumed noise and rate.
+        seed: of the noise.
     """
     rng = np.random.default_rng([seed, 11])
     repeats = plan.repeats or recording.repeats
     mix = rng.normal(size=(repeats, recording.repeats))
     channels, noise = dict[str, Channel](), list[ColumnNoise]()
     for name in possible_channels(scene, recording):
-        measured = recording.channels.get(name)
-        seen = None if measured is None else of_scene(scene, measured)
-        known = seen if seen is not None and seen.columns else None
-        stated = (plan.noise or {}).get(name) if plan.simulated or known is None else None
-        columns = simulated_columns(scene, name) if known is None else known.columns
-        deviation, source, apart = column_noise(known, len(columns), stated, config.noise[name])
-        if known is not None and not plan.simulated:
-            channels[name] = known
+        recorded = recording.channels.get(name)
+        of_joints = None if recorded is None else of_scene(scene, recorded)
+        measured = of_joints if of_joints is not None and of_joints.columns else None
+        stated = (plan.noise or {}).get(name) if plan.simulated or measured is None else None
+        columns = simulated_columns(scene, name) if measured is None else measured.columns
+        deviation, source, deviations = column_noise(measured, len(columns), stated, config.noise[name], config.smooth)
+        if measured is not None and not plan.simulated:
+            channels[name] = measured
         else:
             trace = np.asarray(getattr(rollout, name), float).reshape(len(rollout.time), -1)
             which = [0] if name == "object_angle" else [scene.joints.index(c) for c in columns]
             begin, end = float(recording.time[0]), float(rollout.time[-1])
-            time = begin + np.arange(0.0, end, 1.0 / RATE) if known is None else known.time
+            time = begin + np.arange(0.0, end, 1.0 / config.rate) if measured is None else measured.time
             clean = interpolate(time, begin + rollout.time, trace[:, which])
-            values = noisy(clean, repeats, deviation, apart, rng, mix)
-            unit = unit_of_simulated(scene, name, columns) if known is None else known.unit
+            values = noisy(clean, repeats, deviation, deviations, rng, mix)
+            unit = unit_of_simulated(scene, name, columns) if measured is None else measured.unit
             channels[name] = Channel(name, unit, columns, time, values, np.ones(values.shape, bool))
         noise += [(name, c, channels[name].unit, float(d), source) for c, d in zip(columns, deviation, strict=True)]
     others = {} if plan.simulated else {k: c for k, c in recording.channels.items() if k not in channels}
@@ -187,12 +218,12 @@ def planned_recording(
 
 
 def simulated_columns(scene: Scene, name: str) -> tuple[str, ...]:
-    """Of a channel that nobody measured."""
+    """Return the columns of a channel that was not measured."""
     return (str(scene.object_joint),) if name == "object_angle" else scene.joints
 
 
 def noise_of_log(recording: Recording) -> list[ColumnNoise]:
-    """The noise of a log whose windows or blocks stand for repeats: what fits leave of it counts, and this beside."""
+    """Return the noise of a log in windows or blocks, for display; the tests use the residual of fits instead."""
     return [
         (name, column, channel.unit, float(deviation), "log, from row to row")
         for name, channel in recording.channels.items()
@@ -202,7 +233,7 @@ def noise_of_log(recording: Recording) -> list[ColumnNoise]:
 
 
 def faster_motion(recording: Recording, factor: float) -> Recording:
-    """A commanded recording whose motion is made faster and then stands still, as long as before."""
+    """Return a commanded recording with a faster motion that then stands still, of the same duration."""
 
     def clock(new: np.ndarray, duration: float) -> np.ndarray:
         return np.minimum(factor * new, duration)
@@ -212,12 +243,14 @@ def faster_motion(recording: Recording, factor: float) -> Recording:
 
 @dataclass(frozen=True)
 class HiddenCase:
-    """One rehearsal: nothing hidden (effect ""), or an effect at a place, of some size of one coefficient.
+    """One complete rehearsal, with an effect of some size at a location, or with nothing hidden (effect "").
 
-    size: of the library's coefficient.  times: of the size that the quick form predicts.
-    hidden: how the synthetic robot calls it; empty where the library's own law is simulated.
+    number: of the case.  coefficient, shape: of the library's effect.
+    size: of the library's coefficient.  times: factor on the size that the quick rehearsal predicts.
+    hidden: name of the synthetic robot's law; empty if the library's law is simulated.
+    joint: of the synthetic robot's law.
     amplitude: of the synthetic robot's law, as strong in this motion as `size` (`equally_strong`).
-    form: share of what that law leaves that the library's form could take.
+    form: share of that law's unabsorbed part that the library's law can explain.
     """
 
     number: int
@@ -234,22 +267,24 @@ class HiddenCase:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         what = f"{self.effect}_{self.location}_{self.times:g}x" if self.effect else "nothing"
         return f"{self.number:04d}_{''.join(c if c.isalnum() or c in '._-' else '_' for c in what)}"
 
 
 def hidden_form(scene: Scene, effect: str, location: str, unit: str) -> tuple[str, str]:
-    """What the synthetic robot calls an effect of the library at a place, and its joint; empty where it has none.
+    """Return the name and the joint of the synthetic robot's law for an effect of the library; empty if it has none.
 
-    Where its amplitude has another unit than the library's coefficient it counts as none.
+    A law whose amplitude has another unit than the library's coefficient does not count.
+
+    scene: the robot.  effect, location: of the library.  unit: of its coefficient.
     """
     for name, library in LIBRARY.items():
         on_hinge = ON_HINGE.get(library, library)
         form = HIDDEN[name]
         joint = location if form.on in ("arm", "joint") and location in (*scene.joints, scene.object_joint) else ""
-        called = on_hinge if joint and joint == scene.object_joint else library
-        if called != effect or form.unit.replace("²", "^2") != unit:
+        in_library = on_hinge if joint and joint == scene.object_joint else library
+        if in_library != effect or form.unit.replace("²", "^2") != unit:
             continue
         try:
             check(Applied(name, 0.0, joint), scene)
@@ -267,12 +302,24 @@ def robot_trace(
     case: HiddenCase,
     config: DiscrepancyConfig,
     seed: int,
+    rehearsal: RehearsalConfig = DEFAULT_REHEARSAL,
 ) -> Rollout:
-    """What the synthetic robot does, without noise, as a replay of one sample."""
-    quiet = SyntheticRobotConfig(
-        repeats=1, timestep=0.00025, rate=FINE_RATE, torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0),
-        position_noise=0.0, angle_noise=0.0, angle_rate=FINE_RATE, start_noise=0.0, pose_noise=0.0,
-        side=recording.torque.side,
+    """Simulate the synthetic robot without noise; return its motion as a Rollout of one sample.
+
+    Args:
+        scene: the robot.
+        space: meaning of the values.
+        recording: whose commands it follows.
+        values: [D] of the robot's parameters.
+        case: the hidden effect.
+        config: of the search.
+        seed: of the robot.
+        rehearsal: its time step and rate.
+    """
+    noise_free = SyntheticRobotConfig(
+        repeats=1, timestep=rehearsal.robot_timestep, rate=rehearsal.robot_rate, torque_noise=(0.0, 0.0),
+        torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0, angle_rate=rehearsal.robot_rate, start_noise=0.0,
+        pose_noise=0.0, side=recording.torque.side,
     )  # fmt: skip
     drive = followed(scene, recording, config.compare)
     assert isinstance(drive, Drive)
@@ -282,14 +329,14 @@ def robot_trace(
     values = space.with_known(recording.known, values)
     truth = {name: float(v) for name, v in zip(space.names, values, strict=True)}
     log = record_hidden(
-        robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=quiet, space=space
+        robot, replace(recording, qpos0=start, gains=None), truth, hidden, seed=seed, config=noise_free, space=space
     )
     time = log.channel("torque").time
     position = log.channel("position").values[0].astype(float)
     angle = np.zeros(len(time))
     if "object_angle" in log.channels:
-        seen = log.channel("object_angle")
-        angle = np.interp(time, seen.time, seen.values[0, :, 0])
+        measured = log.channel("object_angle")
+        angle = np.interp(time, measured.time, measured.values[0, :, 0])
     return Rollout(
         time=time - recording.time[0],
         torque=log.channel("torque").values[0].astype(float),

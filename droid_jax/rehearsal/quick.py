@@ -1,4 +1,4 @@
-"""The quick form: what would be found and recovered, from sensitivities alone, without a search."""
+"""The quick rehearsal: which effects would be found and which parameters recovered, from sensitivities alone."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split
 from droid_jax.rehearsal.linear import (
+    DEFAULT_REHEARSAL,
     LinearModel,
     RehearsalConfig,
     alternatives_of,
     distinguishable,
-    leftover_of,
-    taken_by,
+    explained_shares,
+    unabsorbed_part,
 )
-from droid_jax.rehearsal.linearised import Rehearsed, Tell, one_shape_each, rehearsed
+from droid_jax.rehearsal.linearised import Rehearsed, ReportStage, one_shape_each, rehearsed
 from droid_jax.rehearsal.plan import (
     HiddenCase,
     RehearsalPlan,
@@ -44,26 +45,29 @@ from droid_jax.rehearsal.power import smallest_sizes
 
 
 def parameter_identifiability(found: Rehearsed, model: LinearModel, more: float = 1.0) -> tuple[Identifiability, ...]:
-    """What the recordings would say of each base parameter; more: times as many of them."""
+    """Return which base parameters are identifiable from the recordings, or from `more` times as many of them.
+
+    found: the rehearsal.  model: its linear model, or a variant with other channels or repeats.
+    """
     refined, train = found.base.refined, found.case.train
-    seen = np.isin(found.model.train.channel, np.unique(model.train.channel))
-    if not found.model.repeated:  # the validation blocks are fitted by `identify` too
+    some = np.isin(found.model.train.channel, np.unique(model.train.channel))
+    if not found.model.repeated:  # `identify` fits the validation blocks too
         more = 2 * more
-    jacobian = refined.jacobian[seen] * np.sqrt(more * model.repeats / max(found.model.repeats, 1))
-    part = replace(refined, jacobian=jacobian, residual=refined.residual[seen])
+    jacobian = refined.jacobian[some] * np.sqrt(more * model.repeats / max(found.model.repeats, 1))
+    part = replace(refined, jacobian=jacobian, residual=refined.residual[some])
     gaussian = with_stated_prior(_posterior(part, model, train), part)
     return identifiability(gaussian, part.prior, train.identifiability)
 
 
 def _posterior(refined: Refined, model: LinearModel, train: ResidualSet) -> Gaussian:
     rows = model.train.rows
-    # Of the mean of the repeats, as the slopes are.
+    # In units of the noise of the repeats' mean, as the Jacobian is.
     deviations = [rows.deviations * rows.units**0.5] if model.repeated else [np.zeros((1, len(refined.jacobian)))]  # type: ignore[attr-defined]
     return calibrated(refined, deviations, None, train.identifiability.pooling)
 
 
 def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalConfig) -> list[dict[str, Any]]:
-    """Of each coefficient at each place: the smallest size that is found, and what it is taken for."""
+    """Return for each coefficient at each location the smallest size that is found, and effects named instead."""
     model, space = found.model.of(found.compared), found.case.full_space
     wanted = one_shape_each(model.directions)
     out = []
@@ -84,8 +88,13 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
                 "bound": float(model.largest[k]),
                 "noncentrality": size.noncentrality,
                 "taken_for": [
-                    {"effect": r.key.effect, "location": r.key.location, "share": r.share, "below": r.apart}
-                    for r in others
+                    {
+                        "effect": other.key.effect,
+                        "location": other.key.location,
+                        "share": other.share,
+                        "below": other.distinguishable_from,
+                    }
+                    for other in others
                 ],
             }
         )
@@ -93,19 +102,24 @@ def answers(found: Rehearsed, config: DiscrepancyConfig, rehearsal: RehearsalCon
 
 
 def robot_whitened(
-    found: Rehearsed, space: Space, recording: Recording, cases: Sequence[HiddenCase], config: DiscrepancyConfig
+    found: Rehearsed,
+    space: Space,
+    recording: Recording,
+    cases: Sequence[HiddenCase],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig = DEFAULT_REHEARSAL,
 ) -> list[np.ndarray | None]:
-    """[M] of each case what the synthetic robot measures of the training motion, in one repeat's noise.
+    """Return for each case the residual [M] of the synthetic robot's training motion, in one repeat's noise.
 
-    None where its simulation blows up.  MuJoCo's steps leave Python to the other threads.
+    None where its simulation blows up.  The cases are simulated in threads: mj_step releases Python's lock.
     """
     comparison, scene = found.case.train.comparison, found.case.train.cost.scene
-    known = found.base.values[found.case.full_space.columns(space)]
+    values = found.base.values[found.case.full_space.columns(space)]
     clock = comparison.clock - comparison.clock[0]
 
     def simulated(case: HiddenCase) -> Rollout | None:
         try:
-            return robot_trace(scene, space, recording, known, case, config, 0)
+            return robot_trace(scene, space, recording, values, case, config, 0, rehearsal)
         except ValueError:
             return None
 
@@ -127,72 +141,85 @@ def law_checks(
     config: DiscrepancyConfig,
     rehearsal: RehearsalConfig,
 ) -> list[dict[str, Any] | None]:
-    """Of each answer whether an effect of that size would be known for what it is; None where none is found.
+    """Return for each answer whether the search would name an effect of that size; None for effects not found.
 
-    The linear model takes effects to be small and the robot's law to be the library's.  Here each is simulated at the
-    size that was found.  One whose law has a shape is simulated at its best place once more with the law of the
-    synthetic robot, which has another.  Of the two the worse counts: `own` is the share of what the base parameters
-    leave of it that the library's effect takes, `other` a candidate that takes clearly more.
+    The linear model assumes that effects are small and that the robot's law is the library's.  Here each effect is
+    simulated at the size that was found.  An effect whose law has a shape is also simulated at its best location with
+    the synthetic robot's law, which has another shape; the worse result counts.
+
+    Args:
+        found: the rehearsal.
+        space: base parameters.
+        known: results of `answers`.
+        config: of the search.
+        rehearsal: of the rehearsal.
+
+    Returns:
+        law: whose law it is.  own: share of the unabsorbed part that the library's effect explains.  other: a candidate
+        that explains clearly more, or None.  sure: whether the effect would be named.
     """
     out: list[dict[str, Any] | None] = [None] * len(known)
     sizes = [e["smallest"] for e in known]
-    asked = [i for i, size in enumerate(sizes) if np.isfinite(size)]
-    if not found.model.repeated or not asked:
+    numbers = [i for i, size in enumerate(sizes) if np.isfinite(size)]
+    if not found.model.repeated or not numbers:
         return out
     train, wanted, model = found.case.train, one_shape_each(found.model.directions), found.model.of(found.compared)
-    seen = np.isin(found.model.train.channel, found.compared)
+    some = np.isin(found.model.train.channel, found.compared)
 
-    def check(i: int, difference: np.ndarray, law: str) -> None:
-        if not np.isfinite(difference).all():
+    def check(i: int, change: np.ndarray, law: str) -> None:
+        if not np.isfinite(change).all():
             return
-        left = leftover_of(model, difference[seen], np.zeros(len(model.validation.base)), 1.0)
-        taken = taken_by(model, left.at(1.0)[0], left.free[-1])
-        own = max(v for key, v in taken.items() if (key.effect, key.location) == _place(known[i]))
-        alternative = max(taken, key=taken.__getitem__)
-        apart = known[i]["noncentrality"] ** 2 * (taken[alternative] - own)
-        confused = apart > distinguishable(model, config, rehearsal.share)
-        confused &= 1 - own > config.selection.equivalence_factor * (1 - taken[alternative])
-        other = (
-            {"effect": alternative.effect, "location": alternative.location, "share": taken[alternative]}
-            if confused
-            else None
-        )
+        part = unabsorbed_part(model, change[some], np.zeros(len(model.validation.base)), 1.0)
+        shares = explained_shares(model, part.at(1.0)[0], part.free[-1])
+        own = max(share for key, share in shares.items() if (key.effect, key.location) == _place(known[i]))
+        best = max(shares, key=shares.__getitem__)
+        distance = known[i]["noncentrality"] ** 2 * (shares[best] - own)
+        confused = distance > distinguishable(model, config, rehearsal.share)
+        confused &= 1 - own > config.selection.equivalence_factor * (1 - shares[best])
+        other = {"effect": best.effect, "location": best.location, "share": shares[best]} if confused else None
         before, sure = out[i], bool(own >= rehearsal.known and not confused)
         if before is None or (own < before["own"] and not (before["sure"] is False and sure)):
             out[i] = {"law": law, "own": own, "other": other, "sure": sure}
 
-    far = [sizes[i] * float(found.model.sign[wanted[i]]) for i in asked]
-    slopes = sensitivities(train, found.base.values, [found.model.directions[wanted[i]] for i in asked], far)
-    for i, slope, size in zip(asked, slopes, far, strict=True):
-        check(i, slope * size, "the library's")
-    for i, difference in _other_laws(found, space, known, config):
-        check(i, difference, "the synthetic robot's")
+    signed = [sizes[i] * float(found.model.sign[wanted[i]]) for i in numbers]
+    secants = sensitivities(train, found.base.values, [found.model.directions[wanted[i]] for i in numbers], signed)
+    for i, secant, size in zip(numbers, secants, signed, strict=True):
+        check(i, secant * size, "the library's")
+    for i, change in _robot_laws(found, space, known, config, rehearsal):
+        check(i, change, "the synthetic robot's")
     return out
 
 
-def _other_laws(
-    found: Rehearsed, space: Space, known: Sequence[Mapping[str, Any]], config: DiscrepancyConfig
+def _robot_laws(
+    found: Rehearsed,
+    space: Space,
+    known: Sequence[Mapping[str, Any]],
+    config: DiscrepancyConfig,
+    rehearsal: RehearsalConfig,
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Of each effect with a shape, at its best place, what the synthetic robot's law adds to the training part, [M]."""
+    """Number of each effect with a shape, and the change [M] of the training part by the synthetic robot's law.
+
+    It is at the effect's best location.
+    """
     recording, scene = found.roles["train"], found.case.train.cost.scene
     if not recording.command.size:
         return
-    best = [entry for entry, _ in _one_each(known, range(len(known)))]
-    asked, cases = list[int](), [HiddenCase(0)]
+    best = [entry for entry, _ in _best_of_each_effect(known, range(len(known)))]
+    numbers, cases = list[int](), [HiddenCase(0)]
     shaped = {effect.name for effect in found.case.effects if effect.shape_parameters}
     for i, entry in enumerate(known):
         if entry["effect"] not in shaped:
             continue
         name, joint = hidden_form(scene, entry["effect"], entry["location"], entry["unit"])
         if name and np.isfinite(entry["smallest"]) and any(entry is one for one in best):
-            asked.append(i)
+            numbers.append(i)
             cases.append(HiddenCase(0, hidden=name, joint=joint, amplitude=entry["smallest"]))
-    if not asked:
+    if not numbers:
         return
-    plain, *others = robot_whitened(found, space, recording, cases, config)
-    for i, other in zip(asked, others, strict=True):
-        if plain is not None and other is not None:
-            yield i, other - plain
+    without, *with_law = robot_whitened(found, space, recording, cases, config, rehearsal)
+    for i, residual in zip(numbers, with_law, strict=True):
+        if without is not None and residual is not None:
+            yield i, residual - without
 
 
 def _place(entry: Mapping[str, Any]) -> tuple[str, str]:
@@ -206,14 +233,17 @@ def improvements(
     rehearsal: RehearsalConfig,
     faster: Rehearsed | None = None,
 ) -> list[dict[str, Any]]:
-    """What more repeats, another channel or another motion would change, the most helpful first."""
+    """Return what more repeats, another channel or a faster motion would change, the most helpful first.
+
+    known: results of `answers`.  faster: the rehearsal of the faster motion, or None.
+    """
     model, every = found.model.of(found.compared), one_shape_each(found.model.directions)
-    known, wanted = zip(*_one_each(known, every), strict=True)
+    known, wanted = zip(*_best_of_each_effect(known, every), strict=True)
     before = np.array([e["smallest"] for e in known])
     recovered = _recovered(found, model, rehearsal)
     out = []
 
-    def helped(what: str, before: np.ndarray, after: np.ndarray, now: int) -> None:
+    def add(what: str, before: np.ndarray, after: np.ndarray, recovered_after: int) -> None:
         both = np.isfinite(before) & np.isfinite(after)
         ratio = float(np.exp(np.mean(np.log(before[both] / after[both])))) if both.any() else 1.0
         out.append(
@@ -222,7 +252,7 @@ def improvements(
                 "times_smaller": ratio,
                 "newly_found": int(np.sum(~np.isfinite(before) & np.isfinite(after))),
                 "lost": int(np.sum(np.isfinite(before) & ~np.isfinite(after))),
-                "recovered_more": now - recovered,
+                "recovered_more": recovered_after - recovered,
             }
         )
 
@@ -235,28 +265,32 @@ def improvements(
             after = np.where(needed <= [e["bound"] for e in known], needed, np.inf)
         else:
             after = sizes(other, wanted)
-        helped(what, before, after, _recovered(found, other, rehearsal, more))
-    if faster is not None:  # of the training motion alone, as this one
-        moved, here = faster.model.of(found.compared), without_step(model.alone(every))  # nor does the other know it
+        add(what, before, after, _recovered(found, other, rehearsal, more))
+    if faster is not None:  # of the training part alone, without the time step's error, which both models then lack
+        changed, unchanged = faster.model.of(found.compared), without_step(model.alone(every))
         rows = [every.index(k) for k in wanted]
-        helped("the faster motion", sizes(here, rows), sizes(moved, rows), _recovered(faster, moved, rehearsal))
+        add("the faster motion", sizes(unchanged, rows), sizes(changed, rows), _recovered(faster, changed, rehearsal))
     return sorted(out, key=lambda o: -(o["newly_found"] - o["lost"] + 10 * np.log(o["times_smaller"])))
 
 
 def _of_longer_log(entry: Mapping[str, Any], more: float) -> float:
-    """What is asked for of a log so many times as long, without the margin: all but the smallest size that is named."""
-    least = entry["minimum"]
-    limits = {name: (limit, least if name == "minimum effect size" else 0.0) for name, limit in entry["limits"].items()}
+    """Required size for a log `more` times as long, without the margin; the minimum effect size does not change."""
+    minimum = entry["minimum"]
+    limits = {
+        name: (limit, minimum if name == "minimum effect size" else 0.0) for name, limit in entry["limits"].items()
+    }
     return max((fixed + (limit - fixed) / np.sqrt(more) for limit, fixed in limits.values()), default=np.inf)
 
 
 def without_step(model: LinearModel) -> LinearModel:
-    """The model without what the time step leaves."""
+    """Return the model without the time step's error."""
     return replace(model, train=replace(model.train, step=None), validation=replace(model.validation, step=None))
 
 
-def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list[tuple[Mapping[str, Any], int]]:
-    """Of each effect the place and coefficient that is found at the smallest share of its bound."""
+def _best_of_each_effect(
+    known: Sequence[Mapping[str, Any]], wanted: Sequence[int]
+) -> list[tuple[Mapping[str, Any], int]]:
+    """The location and coefficient of each effect that is found at the smallest share of its bound."""
     best: dict[str, tuple[Mapping[str, Any], int]] = {}
     for entry, k in zip(known, wanted, strict=True):
         other = best.get(entry["effect"])
@@ -266,7 +300,7 @@ def _one_each(known: Sequence[Mapping[str, Any]], wanted: Sequence[int]) -> list
 
 
 def _variants(found: Rehearsed) -> Iterator[tuple[str, LinearModel, float]]:
-    """What could be changed of the same motion, its linear model, and how many times as long a log is."""
+    """Changes without another motion, the linear model of each, and the factor on the length of a log."""
     model = found.model.of(found.compared)
     for factor in (2, 4):
         if model.repeated:
@@ -279,6 +313,7 @@ def _variants(found: Rehearsed) -> Iterator[tuple[str, LinearModel, float]]:
 
 
 def _recovered(found: Rehearsed, model: LinearModel, rehearsal: RehearsalConfig, more: float = 1.0) -> int:
+    """Number of parameters of interest that are recovered."""
     verdicts = parameter_identifiability(found, model, more)
     limit = rehearsal.recovered or found.case.train.identifiability.identifiable
     nuisance = dict(zip(found.base.space.names, found.base.space.nuisance, strict=True))
@@ -293,60 +328,60 @@ def quick_rehearsal(
     plan: RehearsalPlan | None = None,
     config: DiscrepancyConfig | None = None,
     rehearsal: RehearsalConfig | None = None,
-    tell: Tell = lambda stage: None,
+    report: ReportStage = lambda stage: None,
     *,
     faster: bool = True,
     step_error: bool = True,
 ) -> tuple[Rehearsed, dict[str, Any]]:
-    """What a search in these recordings would find.
+    """Return what a search in these recordings would find.
 
     Args:
         scene: the robot.
-        space: all that is fitted without any effect.
+        space: all parameters that are fitted without any effect.
         effects: that could be hidden.
         recordings: as given to the search.
-        plan: repeats, noise, channels and parameter values that are stated; None: as measured.
-        config: of the search.
-        rehearsal: what counts as found.
-        tell: called with each stage's name.
-        faster: whether a faster motion is looked at too.
-        step_error: whether to measure what the time step leaves.
+        plan: stated repeats, noise, channels and parameter values; None for those of the measurement.
+        config: of the search; None for the defaults.
+        rehearsal: settings of the rehearsal; None for the defaults.
+        report: called with each stage's name.
+        faster: whether to rehearse a faster motion too.
+        step_error: whether to measure the error of the time step.
 
     Returns:
-        The linear model of the search, and its answers as plain data (rehearsal.json).
+        The linear model of the search, and the answers as plain data (rehearsal.json).
 
     Raises:
-        ValueError: what the search refuses too, or a simulation that blows up.
+        ValueError: the search refuses the inputs too, or a simulation blows up.
     """
     began, used = time.monotonic(), time.process_time()
     plan, config = plan or RehearsalPlan(), config or DiscrepancyConfig()
     rehearsal = rehearsal or RehearsalConfig()
-    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, tell, step_error=step_error)
-    tell("tests")
+    found = rehearsed(scene, space, effects, recordings, plan, config, rehearsal, report, step_error=step_error)
+    report("tests")
     known = answers(found, config, rehearsal)
-    tell("laws")
+    report("laws")
     checks = law_checks(found, space, known, config, rehearsal)
     known = [{**entry, "law": check} for entry, check in zip(known, checks, strict=True)]
     model = found.model.of(found.compared)
     other = None
     if faster and found.model.repeated and all(r.command.size for r in recordings):
-        tell("a faster motion")
-        moved = [faster_motion(r, rehearsal.faster) for r in recordings]
-        other_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
+        report("a faster motion")
+        fast = [faster_motion(r, rehearsal.faster) for r in recordings]
+        fast_plan = replace(plan, repeats=found.model.repeats * (2 if found.split is Split.REPEATS else 1))
         try:
-            with warnings.catch_warnings():  # what there is to warn of was said of the motion itself
+            with warnings.catch_warnings():  # the same warnings were given for the original motion
                 warnings.simplefilter("ignore", UserWarning)
                 other = rehearsed(
-                    scene, space, effects, moved, other_plan, config, rehearsal, tell, step_error=False, train_only=True
+                    scene, space, effects, fast, fast_plan, config, rehearsal, report, step_error=False, train_only=True
                 )
         except ValueError as error:
-            warnings.warn(f"the faster motion was not looked at: {error}", stacklevel=2)
-    tell("improvements")
+            warnings.warn(f"the faster motion was not rehearsed: {error}", stacklevel=2)
+    report("improvements")
     helps = improvements(found, known, config, rehearsal, other)
     limit = rehearsal.recovered or config.identifiability.identifiable
     verdicts = parameter_identifiability(found, model)
-    of = {p.name: p for p in found.base.space.parameters}
-    at = dict(zip(found.case.full_space.names, found.base.values, strict=True))
+    parameters = {p.name: p for p in found.base.space.parameters}
+    values = dict(zip(found.case.full_space.names, found.base.values, strict=True))
     answer = {
         "format": "droid_jax rehearsal 1",
         "form": "quick",
@@ -373,15 +408,15 @@ def quick_rehearsal(
         },
         "parameters": [
             {
-                "name": t.name,
-                "unit": of[t.name].unit,
-                "value": float(at[t.name]),
-                "nuisance": bool(of[t.name].nuisance),
-                "shrinkage": t.shrinkage,
-                "recovered": bool(t.shrinkage < limit),
-                "partners": [list(p) for p in t.partners],
+                "name": verdict.name,
+                "unit": parameters[verdict.name].unit,
+                "value": float(values[verdict.name]),
+                "nuisance": bool(parameters[verdict.name].nuisance),
+                "shrinkage": verdict.shrinkage,
+                "recovered": bool(verdict.shrinkage < limit),
+                "partners": [list(p) for p in verdict.partners],
             }
-            for t in verdicts
+            for verdict in verdicts
         ],
         "effects": known,
         "helps": helps,

@@ -18,13 +18,13 @@ ALL = ("torque", "position", "velocity")
 
 
 def dead(recording: Recording, name: str) -> Recording:
-    """The recording with a channel of zeros."""
+    """The recording with one channel set to zero."""
     channel = recording.channels[name]
     silent = replace(channel, values=np.zeros_like(channel.values))
     return replace(recording, channels={**recording.channels, name: silent})
 
 
-def test_what_follows_from_another_channel_is_not_compared_beside_it():
+def test_channels_that_depend_on_a_compared_one_are_not_compared():
     scene = pendulum()
     every, moved, fast = (swung("a", 1.0, 1.0, names) for names in (ALL, ALL[1:], ALL[2:]))
     assert informative_channels(scene, [every]) == ("torque",)
@@ -32,14 +32,14 @@ def test_what_follows_from_another_channel_is_not_compared_beside_it():
     assert informative_channels(scene, [fast]) == ("velocity",)
 
 
-def test_a_channel_that_never_changes_is_none():
+def test_a_constant_channel_is_not_compared():
     scene, recording = pendulum(), swung("a", 1.0, 1.0, ALL)
     assert informative_channels(scene, [dead(recording, "torque")]) == ("position",)
     with pytest.raises(ValueError, match=r"no measured channel in common .*'a': none"):
         informative_channels(scene, [dead(swung("a", 1.0, 1.0), "position")])
 
 
-def test_along_a_measured_motion_torques_alone_are_simulated():
+def test_along_a_measured_motion_only_torques_are_simulated():
     assert measured_channels(elbow(), elbow_log(0.0, 4.0)) == ("torque",)
     with pytest.raises(ValueError, match=r"'elbow' holds no commands.*position cannot be compared"):
         check_channels([elbow_log(0.0, 4.0)], ["torque", "position"])
@@ -48,13 +48,13 @@ def test_along_a_measured_motion_torques_alone_are_simulated():
 
 
 def rollout(clock: np.ndarray, position: np.ndarray) -> Rollout:
-    """A replay of one joint that moves so."""
+    """A replay of one joint with these positions."""
     flat = np.zeros((len(clock), 1))
     return Rollout(clock, flat, position[:, None], flat, np.zeros(len(clock)), np.zeros((len(clock), 0), bool), True)
 
 
 def test_errors_are_those_of_the_samples_that_were_measured():
-    """Two repeats off by +1 and -3 mrad, of which half of one was not measured; the replay's clock is another."""
+    """Two repeats with errors of +1 and -3 mrad, half of one not measured, and another clock of the replay."""
     time = np.arange(0.0, 1.0, 0.01)
     values = np.stack([time + 1e-3, time - 3e-3])[:, :, None]
     mask = np.ones(values.shape, bool)

@@ -22,12 +22,12 @@ def log() -> LoneLog:
     return lone_log(ready(scene), space, elbow_log(COULOMB), CONFIG.compare, effects)
 
 
-def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
+def test_a_log_is_whitened_as_by_its_cost(log: LoneLog):
     scene = elbow()
     cost = make_cost(ready(scene), elbow_space(scene), [elbow_log(COULOMB)], config=CONFIG.compare)
     values = elbow_space(scene).mean
     whole = log.space.mean
-    stated = cost.restated(values)
+    stated = cost.with_estimated_noise(values)
     deviation = 1 / stated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
     everywhere = np.ones(len(log.clock), bool)
     own = log.with_noise(np.array([deviation]), everywhere)
@@ -38,7 +38,7 @@ def test_a_log_is_whitened_as_its_cost_would(log: LoneLog):
     np.testing.assert_allclose(fitted.residual(whole), 0.0, atol=1e-9)
 
 
-def test_distances_are_of_the_instants_that_count(log: LoneLog):
+def test_distances_are_over_the_instants_with_a_weight(log: LoneLog):
     """Equation 1 over half of the instants, those at which the residual is small."""
     (comparison,) = log.comparisons
     plain = replace(log, comparisons=(replace(comparison, config=replace(comparison.config, whitened=False)),))
@@ -50,7 +50,7 @@ def test_distances_are_of_the_instants_that_count(log: LoneLog):
     assert part / whole == pytest.approx(left[some].mean() / left.mean(), rel=0.08)
 
 
-def test_repeats_are_refused_and_parts_have_names_of_their_own(log: LoneLog):
+def test_repeats_are_refused_and_parts_have_names(log: LoneLog):
     scene = elbow()
     space = elbow_space(scene)
     with pytest.raises(ValueError, match="'elbow' has 2 repeats, and a log in blocks has one"):
@@ -86,14 +86,14 @@ def size(cost: Cost) -> float:
     return float(np.mean(cost.whitened(TRUTH) ** 2))
 
 
-def test_residuals_of_the_truth_are_of_unit_size(cost: Cost):
+def test_residuals_of_the_truth_have_unit_size(cost: Cost):
     sizes = [size(cost), *(size(cost.against([trembling(TREMBLE, seed)])) for seed in (1, 2, 3))]
     np.testing.assert_allclose(sizes, 1.0, atol=0.3)
 
 
 @pytest.mark.slow
 def test_without_it_they_are_not(cost: Cost):
-    """Where one repeat's positions are missing somewhere the repeats do not tell, and all share it."""
+    """If positions of one repeat are missing, the common error of the motion is not estimated."""
     recording = trembling(TREMBLE, seed=1)
     position = recording.channel("position")
     mask = position.mask.copy()
@@ -102,7 +102,7 @@ def test_without_it_they_are_not(cost: Cost):
     assert size(cost.against([holed])) > 4.0
 
 
-def test_the_mean_of_the_repeats_stays_what_was_measured(cost: Cost):
+def test_the_mean_of_the_repeats_is_the_measurement(cost: Cost):
     recording = trembling(TREMBLE, seed=1)
     found, exact = (cost.against([r]).comparisons[0].channel("torque").noise for r in (recording, trembling(0.0)))
     np.testing.assert_allclose(found.mean, exact.mean, atol=1e-5)

@@ -110,7 +110,7 @@ def test_unmeasured_samples_have_no_influence():
     kernel = lowpass(CLOCK, COARSE)
     out = smooth(np.where(mask, values, np.nan), mask, kernel)
     np.testing.assert_array_equal(out, smooth(np.where(mask, values, 1e9), mask, kernel))
-    # and what is left counts as it would alone
+    # and the other samples count as if they were the only ones
     expected = [(k * mask[0, :, 0] * values[0, :, 0]).sum() / (k * mask[0, :, 0]).sum() for k in kernel.toarray()]
     np.testing.assert_allclose(out[0, :, 0], expected, rtol=1e-9)
 
@@ -154,7 +154,7 @@ def test_white_noise_becomes_unit_noise():
 
 
 def test_correlated_noise_becomes_nearly_white_unit_noise():
-    """Shrinking by a tenth towards white noise leaves a tenth of the correlation, on the safe side."""
+    """A tenth of the correlation remains, since the autocovariance is shrunk by a tenth."""
     z = whitened_errors(lambda r, s: first_order(r, s, 0.7, 0.3), repeats=10, length=60, trials=300, minimum=1e-3)
     assert 0.7 < np.mean(z**2) < 1.15
     assert abs(np.mean(z[:, 1:] * z[:, :-1]) / np.mean(z**2)) < 0.25
@@ -163,7 +163,7 @@ def test_correlated_noise_becomes_nearly_white_unit_noise():
 
 
 def test_a_bias_of_each_repeat_is_part_of_the_noise():
-    """AR(1) and a constant that differs from repeat to repeat: the sum of z must not be taken for signal."""
+    """AR(1) and a constant that differs between repeats: the sum of z has the variance of noise."""
 
     def make(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
         return first_order(rng, shape, 0.7, 0.1) + rng.normal(0, 0.3, (shape[0], 1))
@@ -180,7 +180,7 @@ def test_a_bias_of_each_repeat_is_part_of_the_noise():
     assert np.var(z.sum(axis=1)) / 60 < 0.3 * np.mean(naive)
 
 
-def test_noise_is_never_believed_below_the_minimum():
+def test_noise_is_at_least_the_minimum():
     repeats = np.zeros((4, 30, 2))
     noise = estimate_noise(repeats, minimum=0.02)
     np.testing.assert_allclose(noise.whitener, np.broadcast_to(np.eye(30) * 2.0 / 0.02, (2, 30, 30)), rtol=1e-9)
@@ -195,8 +195,8 @@ def test_one_repeat_has_the_minimum_as_white_noise():
 
 
 @pytest.mark.parametrize("absent", [2, 4])
-def test_repeats_that_did_not_measure_a_column_count_for_nothing(absent: int):
-    """Its mean is of fewer repeats, and what fills the gaps says nothing about noise: as if they had not been made."""
+def test_repeats_that_did_not_measure_a_column_have_no_influence(absent: int):
+    """The result is that of the other repeats alone."""
     repeats = np.random.default_rng(3).normal(0, 0.3, (7, 60, 1))
     repeats[:absent] = repeats[absent:].mean(axis=0)
     measured = np.ones((7, 60, 1), bool)
@@ -210,7 +210,7 @@ def test_repeats_that_did_not_measure_a_column_count_for_nothing(absent: int):
     assert (found.count == 7 - absent).all()
 
 
-def test_a_stretch_that_some_repeats_missed_is_believed_less_there():
+def test_a_stretch_that_some_repeats_missed_has_less_weight():
     rng, left = np.random.default_rng(4), []
     measured = np.ones((5, 60, 1), bool)
     measured[:3, 20:40] = False
@@ -223,7 +223,7 @@ def test_a_stretch_that_some_repeats_missed_is_believed_less_there():
     assert square[:20].mean() == pytest.approx(1.0, abs=0.15) and square[20:40].mean() == pytest.approx(1.0, abs=0.15)
 
 
-def test_columns_are_estimated_apart():
+def test_columns_are_estimated_separately():
     rng = np.random.default_rng(1)
     repeats = rng.normal(size=(50, 200, 2)) * [0.1, 1.0]
     noise = estimate_noise(repeats, minimum=1e-3)
@@ -249,7 +249,7 @@ def test_the_stated_deviation_makes_correlated_residuals_count_once():
     np.testing.assert_allclose(noise.whitener, np.eye(30) / np.array([0.3, 3.0])[:, None, None])
 
 
-def test_a_trend_over_the_order_is_taken_away_and_the_mean_stays():
+def test_a_trend_over_the_repeats_is_removed_and_the_mean_is_not():
     rng = np.random.default_rng(5)
     rest, slope = rng.normal(size=(9, 4)), np.array([2.0, 0.0, -1.0, 30.0])
     with_trend = rest + (np.arange(9)[:, None] - 4.0) * slope
@@ -265,8 +265,8 @@ def test_a_trend_over_the_order_is_taken_away_and_the_mean_stays():
 
 
 @pytest.mark.parametrize(("repeats", "forgiven"), [(10, True), (4, False)])
-def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven: bool):
-    """Of few repeats a trend is not told from chance."""
+def test_a_trend_over_the_repeats_is_no_noise(repeats: int, forgiven: bool):
+    """With few repeats a trend cannot be distinguished from chance."""
     rng = np.random.default_rng(6)
     calm = rng.normal(0, 0.1, (repeats, 200, 1))
     warming = calm + 0.5 * (np.arange(repeats) - (repeats - 1) / 2)[:, None, None]
@@ -275,7 +275,7 @@ def test_what_warms_up_from_repeat_to_repeat_is_no_noise(repeats: int, forgiven:
 
 
 def test_the_settings_reach_the_noise():
-    """Each one changes what it says it does, and nothing else decides it."""
+    """Each one changes the quantity that it describes."""
     rng = np.random.default_rng(7)
     white = rng.normal(0, 0.1, (6, 200, 1))
     averaged = white + np.roll(white, 1, axis=1)  # neighbours share half of their variance
@@ -302,8 +302,8 @@ def test_the_settings_reach_the_noise():
 
 
 @pytest.mark.parametrize("gap", [0.05, 0.08, 0.12, 0.14, 0.16, 0.18, 0.5])
-def test_where_a_clock_is_silent_nothing_is_made_up(gap: float):
-    """A sinc's positive and negative parts nearly cancel over a gap: divided by what is left, noise becomes a spike."""
+def test_gaps_of_a_clock_are_not_filled(gap: float):
+    """A sinc's positive and negative parts nearly cancel over a gap; divided by their sum, noise becomes a spike."""
     clock = CLOCK[(CLOCK < 3.0) | (3.0 + gap < CLOCK)]
     rng = np.random.default_rng(3)
     values = 10.0 + 0.05 * rng.normal(size=(200, len(clock), 1))

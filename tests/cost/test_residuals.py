@@ -15,7 +15,7 @@ import pytest
 
 from droid_jax.cost import observation as measured
 from droid_jax.cost.replay_cache import Batched, cached
-from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, restated
+from droid_jax.cost.residuals import CompareConfig, Comparison, make_comparison, with_estimated_noise
 from droid_jax.door.scene import door_scene
 from droid_jax.identify.fit import search_cost
 from droid_jax.model.effect_interface import Rollout
@@ -116,7 +116,7 @@ def equation_1(channels: Mapping[str, tuple[Channel, float, np.ndarray]], clock:
 
 
 def test_distance_is_equation_1(scene: Scene):
-    """Three repeats, other clocks, columns in another order, holes, NaN where nothing was measured."""
+    """Three repeats with different clocks and orders of columns, gaps, and NaN where nothing was measured."""
     rng = np.random.default_rng(4)
     time = np.sort(rng.uniform(0, 2.0, 150))
     values = rng.normal(0, 2, (3, 150, 2))
@@ -137,8 +137,8 @@ def test_distance_is_equation_1(scene: Scene):
     assert float(comparison.distance(simulated)) == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_clock_that_starts_late_is_understood(scene: Scene):
-    """Recording and channel in seconds since something: only differences count."""
+def test_the_origin_of_the_clock_does_not_matter(scene: Scene):
+    """Recording and channel share an arbitrary origin of time."""
     values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
     now = compare(scene, recording(channel("torque", CLOCK, values)))
     later = compare(scene, recording(channel("torque", 100.0 + CLOCK, values), start=100.0))
@@ -158,7 +158,7 @@ def test_samples_beyond_the_replay_are_left_out(scene: Scene):
     assert float(got) == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_repeat_that_was_not_measured_counts_in_no_mean(scene: Scene):
+def test_a_repeat_that_was_not_measured_is_in_no_mean(scene: Scene):
     simulated = rollout()
     values = np.stack([np.asarray(simulated.torque) + np.array([1.0, 0.0, 0.0])] * 4)
     mask = np.ones(values.shape, bool)
@@ -187,7 +187,7 @@ def door_rollout(**parts) -> Rollout:
 
 
 def contact(*gaps: tuple[float, float, int]) -> np.ndarray:
-    """Both fingers touch from 0.5 s on, but for gaps (start, end, finger)."""
+    """Both fingers touch from 0.5 s on, except in gaps (start, end, finger)."""
     out = np.zeros((STEPS, 2), bool)
     out[CLOCK >= 0.5] = True
     for start, end, finger in gaps:
@@ -222,14 +222,14 @@ def test_after_the_release_nothing_is_held(door: Scene):
     assert door_comparison(door).failed(door_rollout(contact=let_go))
 
 
-def test_without_phases_no_grasp_is_asked_for(door: Scene):
+def test_without_phases_no_grasp_is_required(door: Scene):
     nothing = door_rollout(contact=np.zeros((STEPS, 2), bool))
     assert not door_comparison(door, phases=()).failed(nothing)
 
 
 @pytest.mark.parametrize(("opened", "shut"), [(0.05, True), (0.086, True), (0.09, False), (0.5, False)])
 def test_a_door_that_stays_shut_costs_c(door: Scene, opened: float, shut: bool):
-    """Five degrees at least."""
+    """The least angle is five degrees."""
     tried = door_rollout(object_angle=np.linspace(0, opened, STEPS))
     comparison = door_comparison(door, failure_cost=3.0)
     assert bool(comparison.failed(tried)) is shut
@@ -244,14 +244,14 @@ def test_a_door_must_open_half_as_far_as_the_measured_one(door: Scene):
 
 
 def test_a_lid_may_open_downwards_from_anywhere(door: Scene):
-    """Its angle grows less: how far it has moved counts, and not where it is."""
+    """Its angle decreases: the travel counts, not the position."""
     comparison = door_comparison(door, angle=np.linspace(-0.3, -1.1, STEPS))
     for opened, shut in ((0.39, True), (0.41, False)):
         assert bool(comparison.failed(door_rollout(object_angle=np.linspace(-0.3, -0.3 - opened, STEPS)))) is shut
 
 
-def test_of_a_drawer_only_the_measured_one_says_what_is_shut(door: Scene):
-    """Five degrees are no distance."""
+def test_the_travel_of_a_drawer_is_compared_with_the_measured_one_only(door: Scene):
+    """The least angle does not apply to a slide."""
     model = copy.copy(door.model)
     model.jnt_type[door.id("joint", "hinge")] = mujoco.mjtJoint.mjJNT_SLIDE
     drawer = replace(door, model=model)
@@ -262,7 +262,7 @@ def test_of_a_drawer_only_the_measured_one_says_what_is_shut(door: Scene):
 
 
 def test_a_part_of_a_motion_in_which_nothing_opens_does_not_fail(door: Scene):
-    """It asked for five degrees, and for a grip at its last row: the truth failed as everything else did."""
+    """Neither five degrees nor a grip at the last row are required, since the measured door stays shut."""
     still = door_rollout(object_angle=np.zeros(STEPS), contact=contact())
     assert not door_comparison(door, angle=np.linspace(0, 0.01, STEPS)).failed(still)
     later = np.where(CLOCK < 1.99, 0.0, 0.8)  # of the replay's own time alone
@@ -280,7 +280,7 @@ def test_a_part_of_a_motion_in_which_nothing_opens_does_not_fail(door: Scene):
 
 
 def test_a_log_without_commands_grips_and_opens_nothing(door: Scene):
-    """Nothing was replayed that could have failed."""
+    """Its replay has no grip and no object that could fail."""
     values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
     joints = [f"panda_joint{i}" for i in range(1, 8)]
     log = recording(channel("torque", CLOCK, values, joints), phases=PHASES)
@@ -307,7 +307,7 @@ def test_a_replay_that_blew_up_has_finite_costs(scene: Scene, whitened: bool):
 
 @pytest.mark.parametrize("config", [{"whitened": True}, {"channels": {"torque": 50.0}}], ids=["whitened", "weighed"])
 def test_a_replay_that_blew_up_costs_more_than_one_that_is_far_off(scene: Scene, config: dict):
-    """In units of the noise it was the cheapest row: 1000, where 100 N m beside the measurement cost more."""
+    """In noise units too, where an error of 100 N m costs more than 1000."""
     values = np.random.default_rng(0).normal(0, 0.02, size=(4, STEPS, 3))
     comparison = compare(scene, recording(channel("torque", CLOCK, values)), **config)
     far, blown = rollout(torque=100.0 + 0 * smooth_traces(3, 1)), rollout(finite=np.array(False))
@@ -327,7 +327,7 @@ def test_a_replay_that_blew_up_costs_more_than_one_that_is_far_off(scene: Scene,
 
 
 def noisy(truth: np.ndarray, rng: np.random.Generator, repeats: int) -> np.ndarray:
-    """White and first-order noise on every repeat, [N, T, C]."""
+    """White and first-order autoregressive noise of every repeat, [N, T, C]."""
     out = np.empty((repeats, *truth.shape))
     for n in range(repeats):
         slow = np.zeros(truth.shape)
@@ -364,14 +364,14 @@ def test_equal_traces_have_no_residual(scene: Scene):
 
 
 def test_other_clocks_have_no_residual(scene: Scene):
-    """1 kHz and 200 Hz: the same filter, sampled otherwise."""
+    """At 1 kHz and 200 Hz the filter is the same, with other samples."""
     for rate in (1000.0, 200.0):
         time = np.arange(0, CLOCK[-1] + 1e-9, 1 / rate)
         assert np.abs(without_noise(scene, time)).max() < 1.0, rate
 
 
 def test_a_channel_that_covers_part_of_the_motion_has_no_residual(scene: Scene):
-    """The filter is cut at the ends of the data; the simulation must be cut in the same place."""
+    """The filter is truncated at the ends of the data, and must be truncated equally for the simulation."""
     time = np.arange(0.5, 1.5, STEP)
     assert np.abs(without_noise(scene, time)).max() < 1.0
 
@@ -385,7 +385,7 @@ def test_holes_in_the_data_make_no_residual(scene: Scene):
 
 
 def test_holes_do_not_multiply_the_memory(scene: Scene):
-    """The filter of each column stands for all repeats: no array of repeats x columns x samples x samples."""
+    """One filter per column serves all repeats; there is no array of repeats x columns x samples x samples."""
     values = np.random.default_rng(0).normal(size=(12, STEPS, 3))
     mask = np.random.default_rng(1).random(values.shape) > 0.05
     tracemalloc.start()
@@ -396,14 +396,14 @@ def test_holes_do_not_multiply_the_memory(scene: Scene):
     assert peak < 4 * 8 * 3 * instants * STEPS  # bytes of four filters written out for three columns
 
 
-def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene):
-    """What is left of a replay, in the channel's own unit."""
+def test_the_noise_of_a_single_repeat_is_estimated_for_every_channel(scene: Scene):
+    """It is the residual of a replay, in the channel's unit."""
     values = rollout().torque[None], rollout().position[None]
     channels = [channel(n, CLOCK, v) for n, v in zip(("torque", "position"), values, strict=True)]
     comparison = compare(scene, recording(*channels), channels={"torque": 1.0, "position": 1.0})
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = rollout(torque=rollout().torque + 0.5 * wave, position=rollout().position + 0.02 * wave)
-    (stated,) = restated([comparison], [tried])
+    (stated,) = with_estimated_noise([comparison], [tried])
     torque, position = (1 / stated.channel(n).noise.whitener[:, 0, 0] for n in ("torque", "position"))
     np.testing.assert_allclose(torque / position, 25.0, rtol=0.01)
     assert np.all(torque > 0.3)
@@ -411,16 +411,17 @@ def test_the_noise_of_a_single_repeat_is_restated_for_every_channel(scene: Scene
     assert np.mean(np.asarray(stated.whitened(tried)) ** 2) < 1.0 and shape == (3, shape[1], shape[1])
 
 
-def test_recordings_of_the_same_columns_share_a_restated_noise(scene: Scene):
-    """In equal parts with its own."""
+def test_recordings_of_the_same_columns_share_an_estimated_noise(scene: Scene):
+    """It is the geometric mean of the own and the shared noise."""
     logs = [compare(scene, recording(channel("torque", CLOCK, rollout().torque[None]))) for _ in range(3)]
     repeated = compare(scene, recording(channel("torque", CLOCK, np.repeat(rollout().torque[None], 2, axis=0))))
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5, 0.7, 0.7)]
-    *of_logs, untouched = restated([*logs, repeated], tried)
+    *of_logs, untouched = with_estimated_noise([*logs, repeated], tried)
     whiteners = [c.channel("torque").noise.whitener for c in of_logs]
     alone = [
-        1 / restated([c], [t])[0].channel("torque").noise.whitener[:, 0, 0] for c, t in zip(logs, tried, strict=False)
+        1 / with_estimated_noise([c], [t])[0].channel("torque").noise.whitener[:, 0, 0]
+        for c, t in zip(logs, tried, strict=False)
     ]
     assert alone[0] == pytest.approx(alone[2] / 7, rel=0.05)
     shared = np.sqrt(np.mean(np.square(alone), axis=0))
@@ -429,21 +430,21 @@ def test_recordings_of_the_same_columns_share_a_restated_noise(scene: Scene):
     assert untouched is repeated
 
 
-def test_a_log_whose_simulation_blew_up_takes_nothing_from_the_others(scene: Scene):
-    """The others are stated as without it, and it keeps what it had: a stiffer servo's log, at another log's best."""
+def test_a_log_whose_simulation_blew_up_does_not_change_the_noise_of_others(scene: Scene):
+    """The noise of the others is as without it, and its own noise is unchanged."""
     logs = [compare(scene, recording(channel("torque", CLOCK, rollout().torque[None]))) for _ in range(3)]
     wave = np.sin(2 * np.pi * 1.5 * CLOCK)[:, None]
     tried = [rollout(torque=rollout().torque + size * wave) for size in (0.1, 0.5)]
     blown = rollout(torque=np.full_like(rollout().torque, np.nan), finite=np.array(False))
-    *both, kept = restated(logs, [*tried, blown])
-    alone = restated(logs[:2], tried)
+    *both, kept = with_estimated_noise(logs, [*tried, blown])
+    alone = with_estimated_noise(logs[:2], tried)
     for one, other in zip(both, alone, strict=True):
         np.testing.assert_array_equal(one.channel("torque").noise.whitener, other.channel("torque").noise.whitener)
     assert kept is logs[2]
 
 
 def test_repeats_deviate_as_they_are_whitened(scene: Scene):
-    """A model that is one repeat leaves what the model that is the mean leaves, and that repeat's deviation."""
+    """The residual of a model that equals one repeat is that of the mean, plus the repeat's deviation."""
     clean = smooth_traces(3, 2)
     values = clean + np.array([0.2, -0.5, 0.3])[:, None, None] * smooth_traces(3, 5) + 0.01
     comparison = compare(scene, recording(channel("torque", CLOCK, values)))
@@ -456,7 +457,7 @@ def test_repeats_deviate_as_they_are_whitened(scene: Scene):
 
 
 @pytest.mark.parametrize("start", [0.0, 100.0])
-def test_the_grasp_is_looked_at_on_the_recordings_own_clock(door: Scene, start: float):
+def test_the_grasp_is_checked_on_the_clock_of_the_recording(door: Scene, start: float):
     phases = tuple(Phase(p.name, p.start + start, p.end + start) for p in PHASES)
     values = np.random.default_rng(0).normal(size=(2, STEPS, 7))
     torque = channel("torque", start + CLOCK, values, [f"panda_joint{i}" for i in range(1, 8)])
@@ -475,10 +476,10 @@ def test_a_dead_channel_is_refused(scene: Scene):
         compare(scene, recording(channel("torque", CLOCK, values)))
 
 
-@pytest.mark.parametrize(("repeats", "dead", "do"), [(3, 3, "leave the joint away"), (3, 1, "mask it out there, or le"),
-                                                     (2, 1, "leave that repeat away")])  # fmt: skip
-def test_what_is_advised_of_a_dead_column_works(scene: Scene, repeats: int, dead: int, do: str):
-    """Masking was advised where it leaves no repeat, or one, that measured the column, which is refused in turn."""
+@pytest.mark.parametrize(("repeats", "dead", "do"), [(3, 3, "leave the joint out"), (3, 1, "mask it out there, or le"),
+                                                     (2, 1, "leave that repeat out")])  # fmt: skip
+def test_the_advice_for_a_dead_column_works(scene: Scene, repeats: int, dead: int, do: str):
+    """Masking is advised only if two repeats remain that measured the column."""
     values = np.random.default_rng(0).normal(size=(repeats, STEPS, 3))
     values[:dead, :, 1] = 0.0
     with pytest.raises(ValueError, match=rf"a dead sensor\? {do}"):
@@ -504,7 +505,7 @@ def test_unknown_channels_and_joints_are_named(scene: Scene):
 
 
 def test_joints_that_were_left_out_are_not_compared(scene: Scene):
-    """A dead sensor among them harms nobody."""
+    """One of them may be a dead sensor."""
     values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
     values[:, :, 1] = 0.0
     of = compare(replace(scene, joints=("c", "a")), recording(channel("torque", CLOCK, values)))
@@ -514,7 +515,7 @@ def test_joints_that_were_left_out_are_not_compared(scene: Scene):
     np.testing.assert_allclose(measured.noise.mean[:, ::-1], alone.channel("torque").noise.mean)
 
 
-def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
+def test_a_stretch_that_no_repeat_measured_is_refused(scene: Scene):
     values = np.random.default_rng(0).normal(size=(2, STEPS, 3))
     mask = np.ones(values.shape, bool)
     mask[:, 200:600, 1] = False
@@ -524,9 +525,9 @@ def test_a_stretch_that_nobody_measured_is_refused(scene: Scene):
 
 @pytest.mark.parametrize("stamps", [True, False], ids=["masked", "without stamps"])
 def test_a_dropout_of_one_repeat_is_left_out(scene: Scene, stamps: bool):
-    """Five lost samples of a 50 Hz log were refused, and `check` called them harmless.
+    """Five lost samples of a 50 Hz log are accepted.
 
-    A trace's size is fitted: with the dropout as without, whatever stands there, and with a restated noise too.
+    A trace's size is fitted: with the dropout as without, whatever stands there, and with an estimated noise too.
     """
     slow = np.arange(0.0, 2.0, 0.02)
     shape = smooth_traces(3, 1)
@@ -577,7 +578,7 @@ def test_an_angle_without_an_object_is_refused(scene: Scene):
         compare(scene, recording(channel("object_angle", CLOCK, values, ["hinge"])), channels={"object_angle": 1.0})
 
 
-def test_columns_that_were_silent_together_share_a_filter(scene: Scene):
+def test_columns_with_the_same_gaps_share_a_filter(scene: Scene):
     values = np.stack([smooth_traces(3, 1)] * 3) + np.random.default_rng(0).normal(0, 0.05, (3, STEPS, 3))
     mask = np.ones(values.shape, bool)
     mask[1, 300:420] = False
@@ -608,7 +609,7 @@ ROWS = np.array([[1.0, 2.0], [3.0, 4.0]])
 
 
 def counted(counts: list[int]) -> Batched:
-    """[P, 2] -> [P, 3], which counts how often it is asked."""
+    """A function [P, 2] -> [P, 3] that counts its calls."""
 
     def compute(rows: np.ndarray) -> np.ndarray:
         counts.append(len(rows))
@@ -633,14 +634,14 @@ def test_nothing_is_computed_twice(tmp_path: Path, counts: list[int]):
 
 
 def test_the_last_digits_of_a_double_are_not_another_row(tmp_path: Path, counts: list[int]):
-    """A replay is given single precision."""
+    """Replays have single precision."""
     remembered = cached(counted(counts), tmp_path / "train", "whitened")
     np.testing.assert_array_equal(remembered(ROWS), remembered(ROWS + 1e-12))
     remembered(ROWS + 1e-3)
     assert counts == [2, 2]
 
 
-def test_recordings_and_functions_do_not_share_what_they_remember(tmp_path: Path, counts: list[int]):
+def test_recordings_and_functions_do_not_share_cached_results(tmp_path: Path, counts: list[int]):
     for role in ("train", "validation"):
         for what in ("whitened", "distances"):
             cached(counted(counts), tmp_path / role, what)(ROWS)
@@ -680,7 +681,7 @@ def of_another_recording(path: Path) -> None:
 
 @pytest.mark.parametrize("change", [changed_rows, of_another_row, of_another_recording])
 def test_a_file_of_something_else_is_computed_again(tmp_path: Path, counts: list[int], change: Callable[[Path], None]):
-    """One that can be read, and is not what was written there."""
+    """The file can be read, but its content was not written there."""
     remembered = cached(counted(counts), tmp_path / "train", "whitened")
     whole = remembered(ROWS)
     (path,) = (tmp_path / "train").iterdir()
@@ -691,8 +692,8 @@ def test_a_file_of_something_else_is_computed_again(tmp_path: Path, counts: list
     assert counts == [2, 2, 2]
 
 
-def test_the_same_numbers_in_another_shape_are_another_question(tmp_path: Path):
-    """As where other code asks about one parameter more: the bytes may agree."""
+def test_the_same_bytes_in_another_shape_are_another_key(tmp_path: Path):
+    """With another number of parameters the bytes may be equal."""
     sums = cached(lambda rows: np.asarray(rows, float).sum(axis=1), tmp_path / "train", "sums")
     wide = np.arange(6.0).reshape(2, 3)
     np.testing.assert_array_equal(sums(wide), [3.0, 12.0])

@@ -62,8 +62,8 @@ def _names(effect: Any) -> set[str]:
 # ----- there and back
 
 
-def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
-    """An inertia about one axis that is larger than the other two together; the replay takes it."""
+def test_a_model_without_an_mjcf_is_still_saved(tmp_path: Path):
+    """One moment of inertia exceeds the sum of the other two, which the compiler refuses and the replay accepts."""
     scene, _ = small_scene()
     body = int(scene.model.jnt_bodyid[scene.id("joint", JOINTS[0])])
     inertia = Parameter("inertia", "kg m^2", 50.0, 1.0, 0.0, 99.0, writes=(Write("body_inertia", (body, 1)),))
@@ -77,7 +77,7 @@ def test_a_model_that_makes_no_mjcf_is_saved_all_the_same(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_cost_is_that_of_the_search(found: Small, saved: Path):
-    """Compiled with the one effect alone instead of the whole library: 3e-4 N m is what that may change."""
+    """It is compiled with one effect instead of the full library, which may change it by 3e-4 N m."""
     scene, _ = small_scene()
     model = load_extended(saved, scene)
     assert [e.name for e in model.effects] == ["hinge_preload"]
@@ -90,7 +90,7 @@ def test_the_cost_is_that_of_the_search(found: Small, saved: Path):
     assert cost(without[None])[0] > own + 0.3
 
 
-def test_the_values_are_the_ones_found_and_the_gaussian_is_around_them(found: Small, saved: Path):
+def test_the_values_are_those_of_the_fit_and_the_gaussian_is_centred_on_them(found: Small, saved: Path):
     scene, base = small_scene()
     model = load_extended(saved, scene)
     assert model.space.names == (*base.names, "hinge_preload")
@@ -122,7 +122,7 @@ def test_a_model_without_effects_is_the_base_model(found: Small, tmp_path: Path)
         _ = model.effect_space
 
 
-def test_shapes_and_locations_come_back(tmp_path: Path):
+def test_shapes_and_locations_are_restored(tmp_path: Path):
     scene, base = small_scene()
     values = {"latch_torque": 1.2, "latch_width": 0.05, "latch_exponent": 1.5, "torque_gain[elbow]": 0.04}
     save_extended(tmp_path, with_effects(scene, base, **values))
@@ -139,8 +139,8 @@ def test_shapes_and_locations_come_back(tmp_path: Path):
 # ----- MJCF
 
 
-def test_what_mjcf_has_no_words_for_is_listed(tmp_path: Path):
-    """The base part as MJCF, nothing but JSON beside it."""
+def test_effects_that_mjcf_cannot_express_are_listed(tmp_path: Path):
+    """The MJCF holds the base parameters only."""
     scene, base = small_scene()
     save_extended(tmp_path, with_effects(scene, base, latch_torque=1.2, hinge_preload=0.5))
     content = json.loads((tmp_path / "extended.json").read_text())
@@ -151,8 +151,8 @@ def test_what_mjcf_has_no_words_for_is_listed(tmp_path: Path):
 
 
 @pytest.mark.parametrize("degrees", [False, True])
-def test_laws_that_mujoco_has_numbers_for_are_in_the_mjcf(degrees: bool):
-    """A preload is a spring whose rest lies elsewhere, dry friction a friction loss."""
+def test_laws_that_mjcf_can_express_are_in_the_mjcf(degrees: bool):
+    """A preload is a spring with another reference, dry friction is frictionloss."""
     scene, base = small_scene()
     scene.spec.compiler.degree = degrees
     values = {"hinge_preload": 0.5, "joint_coulomb[elbow]": 0.2}
@@ -257,7 +257,7 @@ def test_a_damaged_file(saved: Path, tmp_path: Path, change: Any, expected: str)
 
 
 def test_another_scene_is_refused(saved: Path):
-    """Parameters write by index: into another scene they would write something else."""
+    """Parameters write by index, so in another scene they would write other numbers."""
     with pytest.raises(ValueError, match="fitted with another scene"):
         load_extended(saved, load_scene(SCENE, object_joint="door", joints=JOINTS[:2]))
     with pytest.raises(ValueError, match="fitted with another scene"):
@@ -275,7 +275,7 @@ def test_half_a_file_is_not_json(saved: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_three_lines_of_the_document_run(found: Small, saved: Path, monkeypatch: pytest.MonkeyPatch):
-    """docs/gap.md, as it is printed; runs/gap is this test's folder."""
+    """The lines of docs/gap.md, with this test's folder as runs/gap."""
     text = (ROOT / "docs" / "gap.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert "runs/gap/extended.json" in code

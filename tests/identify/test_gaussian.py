@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from droid_jax.identify.gaussian import Gaussian, load_gaussian, prior, space_from_json, space_to_json
+from droid_jax.identify.gaussian import Gaussian, ParameterEntry, load_gaussian, prior, space_of, space_to_json
 from droid_jax.identify.truncated_normal import gibbs, quantiles
 from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space, Write
+from droid_jax.read_json import typed
 
 
 def wide(name, mean=0.0, std=1.0, **kw):
@@ -28,12 +29,12 @@ COV = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.5], [0.0, -0.5, 0.7]])
 
 @pytest.fixture
 def free():
-    """Three linear parameters whose bounds cut nothing off, in physical coordinates."""
+    """Three linear parameters with wide bounds, in physical coordinates."""
     space = Space((wide("a"), wide("b"), wide("c")))
     return Gaussian(space, np.array([1.0, -2.0, 0.5]), COV, "test", "physical")
 
 
-def test_prior_is_the_space_s_own_gaussian():
+def test_prior_is_the_gaussian_of_the_space():
     g = prior(Space((wide("a", 3.0, 2.0), log_parameter())))
     assert g.rule == "prior" and g.coordinates == "search"
     np.testing.assert_allclose(g.quantiles([0.5])[0], [3.0, 1.0])
@@ -55,7 +56,7 @@ def test_sample_is_a_function_of_the_seed(free):
 
 @pytest.mark.parametrize("coordinates", ["search", "physical"])
 def test_rows_out_of_bounds_are_drawn_again(coordinates):
-    """A door's damping of 0.10 with deviation 0.19: rows redrawn, never piled up at zero."""
+    """A door's damping of 0.10 with deviation 0.19: rows are redrawn, not clipped to zero."""
     space = Space((Parameter("damping", "N m s/rad", 0.10, 0.19, 0.0, 5.0), wide("other")))
     mean, cov = (np.zeros(2), np.eye(2))
     if coordinates == "physical":
@@ -69,7 +70,7 @@ def test_rows_out_of_bounds_are_drawn_again(coordinates):
 
 
 def test_whole_rows_are_drawn_again():
-    """Cutting one of two correlated parameters moves the other: scipy's conditional mean."""
+    """Truncating one of two correlated parameters moves the other; the oracle is scipy's truncated mean."""
     space = Space((Parameter("a", "u", 0.0, 1.0, 0.0, 50.0), wide("b")))
     g = Gaussian(space, np.zeros(2), np.array([[1.0, 0.8], [0.8, 1.0]]), "test", "physical")
     draws = g.sample(0, 50_000)
@@ -78,14 +79,14 @@ def test_whole_rows_are_drawn_again():
 
 
 def test_log_scaled_parameters_are_clipped_and_reach_zero():
-    """Log-scaled draws beyond a bound of zero become zero, with the normal's own probability."""
+    """Log-scaled draws beyond a bound of zero become zero, with the probability of the normal."""
     p = log_parameter(floor=0.1, width=1.0)
     draws = prior(Space((p,))).sample(0, 50_000)[:, 0]
     expected = stats.norm.cdf(math.log(0.1 / 1.1))
     assert abs((draws == 0.0).mean() - expected) < 3 * math.sqrt(expected / 50_000)
 
 
-def test_far_bounds_are_drawn_from_all_the_same():
+def test_draws_are_possible_inside_distant_bounds():
     space = Space((Parameter("good", "u", 0.0, 1.0, -9.0, 9.0), Parameter("bad", "u", 0.5, 1.0, 0.0, 1.0)))
     draws = Gaussian(space, np.array([0.0, -30.0]), np.eye(2), "test", "physical").sample(0, 5_000)
     assert stats.kstest(draws[:, 0], stats.norm.cdf).pvalue > 1e-3
@@ -105,7 +106,7 @@ def test_many_parameters_at_a_bound_are_sampled():
 
 
 def test_gibbs_sampling_agrees_with_rejection():
-    """Correlated, half of the variables cut: moments of all, those without bounds included."""
+    """Moments of correlated variables, half of which have bounds."""
     rng = np.random.default_rng(2)
     axes = np.linalg.qr(rng.normal(size=(4, 4)))[0]
     cov = axes @ np.diag([2.0, 1.0, 0.3, 0.05]) @ axes.T
@@ -202,12 +203,12 @@ def test_marginal_follows_the_names(free):
         ("coordinates", "log", "coordinates"),
     ],
 )
-def test_what_is_no_gaussian_is_refused(free, field, value, message):
+def test_invalid_gaussians_are_refused(free, field, value, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(free, **{field: value})
 
 
-def test_units_decades_apart_are_no_reason_to_refuse():
+def test_variances_of_very_different_scale_are_accepted():
     space = Space((wide("tiny"), wide("huge")))
     Gaussian(space, np.zeros(2), np.array([[1e-14, 0.9e-5], [0.9e-5, 1e4]]), "test", "physical")
     with pytest.raises(ValueError, match="semi-definite"):
@@ -237,7 +238,11 @@ def test_save_and_load_give_the_same_gaussian(saved):
     assert os.listdir(path.parent) == [path.name]
 
 
-def test_roles_survive_json_text_and_older_files_state_none():
+def space_from_json(entries):
+    return space_of(typed(entries, list[ParameterEntry], "space"))
+
+
+def test_roles_survive_json_and_may_be_missing_as_in_older_files():
     one = Parameter("a", "kg", 0.0, 1.0, -5.0, 5.0, role=Role.PAYLOAD_MASS)
     other = Parameter("torque_offset[b]", "N m", 0.0, 1.0, -5.0, 5.0)
     entries = json.loads(json.dumps(space_to_json(Space((one, other)))))
@@ -247,7 +252,7 @@ def test_roles_survive_json_text_and_older_files_state_none():
     assert space_from_json(entries)["a"].role is Role.OTHER
 
 
-def test_the_space_survives_json_text():
+def test_the_space_survives_json():
     space = Space((wide("a"), log_parameter(writes=WRITES)))
     assert space_from_json(json.loads(json.dumps(space_to_json(space)))) == space
 
@@ -302,10 +307,10 @@ def test_missing_and_truncated_files_are_named(saved):
 
 @pytest.mark.parametrize("mean", [-0.4, 0.0, 0.3, 1.0, 4.0])
 @pytest.mark.parametrize("coordinates", ["search", "physical"])
-def test_an_interval_holds_its_centre_and_enough_of_the_mass_and_ends_at_the_bounds(
+def test_an_interval_holds_its_centre_and_its_probability_and_ends_at_the_bounds(
     mean: float, coordinates: Literal["search", "physical"]
 ):
-    """One parameter of 0 or more, unit deviation: away from the bound 1.645 to either side, at it one-sided."""
+    """One parameter of 0 or more, of unit deviation: 1.645 to both sides far from the bound, one-sided at it."""
     space = Space((Parameter("a", "N m", 1.0, 1.0, 0.0, 10.0),))
     at = np.array([mean]) if coordinates == "physical" else space.to_search(np.array([mean]))
     gaussian = Gaussian(space, at, np.eye(1), "made up", coordinates)

@@ -29,7 +29,7 @@ def space_of(dims, nuisances=0):
 
 
 def fitted(jacobian, residual=None, *, x=None, width=4.0, nuisances=0):
-    """A refinement that ended at x with this jacobian [M, D]; its residual is zero unless given."""
+    """A refinement that ended at x with this Jacobian [M, D]; the residual is zero by default."""
     rows, dims = jacobian.shape
     space = space_of(dims, nuisances)
     residual = np.zeros(rows) if residual is None else residual
@@ -57,7 +57,7 @@ def deviations(gaussian):
     return np.sqrt(np.diag(gaussian.cov))
 
 
-def apart(repeats):
+def deviations_from_mean(repeats):
     """Deviations of repeats [N, M] from their mean, as a comparison gives them."""
     return repeats - repeats.mean(axis=0)
 
@@ -69,7 +69,7 @@ def white(rng, count, size):
 
 def exactly(scale, count, size):
     """Deviations [N, M] of repeats whose mean has noise of exactly this scale, uncorrelated between residuals."""
-    draws = apart(np.random.default_rng(9).normal(size=(count, size)))
+    draws = deviations_from_mean(np.random.default_rng(9).normal(size=(count, size)))
     return scale * np.sqrt(count * (count - 1)) * np.linalg.qr(draws)[0]
 
 
@@ -80,10 +80,10 @@ SQUARE = np.kron(np.eye(2), np.full((8, 1), 5.0))  # [16, 2]: eight residuals se
 # ---------------------------------------------------------------- scatter between repeats
 
 
-def test_repeats_with_the_assumed_noise_leave_the_gauss_newton_covariance():
-    """A thousand repeats whose mean has unit white noise: what H^-1 believes, so it stays."""
+def test_repeats_with_the_assumed_noise_give_the_gauss_newton_covariance():
+    """A thousand repeats whose mean has unit white noise, as H^-1 assumes."""
     fit = fitted(SKEW)
-    gaussian = calibrated(fit, [apart(white(np.random.default_rng(1), 1000, 30))], one_block(SKEW))
+    gaussian = calibrated(fit, [deviations_from_mean(white(np.random.default_rng(1), 1000, 30))], one_block(SKEW))
     plain = np.linalg.inv(SKEW.T @ SKEW + np.eye(3) / 16)
     np.testing.assert_allclose(gaussian.cov, plain, rtol=0.1)
     np.testing.assert_array_equal(gaussian.mean, fit.x)
@@ -105,7 +105,7 @@ def test_quiet_repeats_do_not_narrow():
 
 
 def test_a_pattern_shared_by_all_residuals_widens_the_parameter_that_it_looks_like():
-    """Repeats differ by c_n times p0's slopes: var(p0) is the scatter of the mean of the c_n, drawn to the pool."""
+    """Repeats differ by c_n times p0's slopes: var(p0) is that of the mean of the c_n, shrunk to the pooled one."""
     shifts = np.array([-9.0, -3.0, -2.0, 0.0, 5.0, 9.0])
     count = len(shifts)
     pattern = np.outer(shifts, SQUARE[:, 0])
@@ -122,7 +122,7 @@ def test_a_pattern_shared_by_all_residuals_widens_the_parameter_that_it_looks_li
 def test_own_ratio_outweighs_the_pool_with_many_repeats():
     rng = np.random.default_rng(4)
     repeats = white(rng, 400, 16) + np.outer(rng.normal(scale=20.0, size=400), SQUARE[:, 0]) / np.sqrt(200.0)
-    gaussian = calibrated(fitted(SQUARE), [apart(repeats)], one_block(SQUARE))
+    gaussian = calibrated(fitted(SQUARE), [deviations_from_mean(repeats)], one_block(SQUARE))
     factor = deviations(gaussian) * np.sqrt(200.0 + 1 / 16)
     # the shared part adds 20^2 / N to a variance of 1: p0 doubles its variance, p1 keeps it
     np.testing.assert_allclose(factor**2, [2.0, 1.0], rtol=0.12)
@@ -134,8 +134,8 @@ def test_one_repeat_widens_nothing():
     np.testing.assert_allclose(gaussian.cov, np.linalg.inv(fit.hessian), rtol=1e-12)
 
 
-def test_each_recording_s_repeats_speak_for_its_own_residuals():
-    """Two recordings see one parameter each: the second's repeats scatter three times as far, the first has one."""
+def test_the_repeats_of_a_recording_apply_to_its_residuals_only():
+    """Each of two recordings constrains one parameter.  The second's repeats scatter three times as far."""
     count = 101
     recordings = [np.zeros((1, 8)), exactly(3.0, count, 8)]
     gaussian = calibrated(fitted(SQUARE), recordings, one_block(SQUARE))
@@ -154,8 +154,8 @@ IDS = np.repeat(np.arange(4), BLOCK)
 SINGLE = [np.zeros((1, len(COLUMN)))]  # one repeat: the blocks alone decide
 
 
-def test_residuals_constant_within_blocks_widen_as_their_sandwich_says():
-    """Six equal residuals are one datum: H^-1 takes them for six, the blocks' scores do not."""
+def test_residuals_constant_within_blocks_widen_by_their_sandwich():
+    """Six equal residuals are one datum for the blocks' scores, but six for H^-1."""
     gaussian = calibrated(fitted(COLUMN, SIGNS), SINGLE, IDS)
     squares = 9.0 + 4.0 + 16.0 + 1.0
     hessian = BLOCK * squares + 1 / 16
@@ -163,7 +163,7 @@ def test_residuals_constant_within_blocks_widen_as_their_sandwich_says():
     assert gaussian.cov[0, 0] == pytest.approx(BLOCK / hessian, rel=1e-2)
 
 
-def test_a_model_that_is_taken_to_be_right_is_not_widened_by_what_it_leaves_over():
+def test_a_model_that_is_taken_to_be_right_is_not_widened_by_its_residual():
     fit = fitted(COLUMN, SIGNS)
     assert deviations(calibrated(fit, SINGLE, None)) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(fit.hessian))))
     loud = [exactly(2.0, 40, 30)]
@@ -178,7 +178,7 @@ def test_residuals_that_alternate_within_blocks_widen_nothing():
     assert gaussian.cov[0, 0] == pytest.approx(1 / (BLOCK * 30.0 + 1 / 16), rel=1e-9)
 
 
-def test_the_larger_of_both_scatters_counts_for_each_parameter():
+def test_the_larger_of_both_scatters_is_used_for_each_parameter():
     """Eight equal residuals make p0's variance 8 times as large; the repeats make both parameters' 4 times."""
     residual = np.concatenate([np.ones(8), np.tile([1.0, -1.0], 4)])
     ids = np.repeat([0, 1], 8)
@@ -190,7 +190,9 @@ def test_the_larger_of_both_scatters_counts_for_each_parameter():
 def test_widening_keeps_correlations():
     """Deviations change by different factors, correlations do not."""
     rng = np.random.default_rng(7)
-    repeats = apart(white(rng, 50, 30) + 30.0 * np.outer(rng.normal(size=50), SKEW[:, 0] / np.linalg.norm(SKEW[:, 0])))
+    repeats = deviations_from_mean(
+        white(rng, 50, 30) + 30.0 * np.outer(rng.normal(size=50), SKEW[:, 0] / np.linalg.norm(SKEW[:, 0]))
+    )
     fit = fitted(SKEW, nuisances=1)
     plain, wide = np.linalg.inv(fit.hessian), calibrated(fit, [repeats], one_block(SKEW)).cov
     factor = np.sqrt(np.diag(wide) / np.diag(plain))
@@ -205,18 +207,18 @@ REPEATS = 10
 
 
 def one_problem(rng):
-    """A linear problem's fit, its repeats and its truth; each repeat has errors that pull at all residuals together."""
+    """A linear problem's fit, its repeats and its truth; each repeat has an error common to all residuals."""
     jacobian = rng.normal(size=(40, 3)) @ (np.eye(3) + 0.5 * rng.normal(size=(3, 3)))
     truth = rng.normal(scale=4.0, size=3)
     pose = np.sqrt(REPEATS) * rng.normal(size=(REPEATS, 3)) @ rng.normal(size=(3, 40))
     repeats = jacobian @ truth + white(rng, REPEATS, 40) + pose
     measured = repeats.mean(axis=0)
     x = np.linalg.solve(jacobian.T @ jacobian + np.eye(3) / 16, jacobian.T @ measured)
-    return fitted(jacobian, jacobian @ x - measured, x=x), apart(repeats), truth
+    return fitted(jacobian, jacobian @ x - measured, x=x), deviations_from_mean(repeats), truth
 
 
 def another_problem(rng):
-    """The same of one repeat, whose error is constant over four residuals at a time, a hundred times."""
+    """The same for one repeat, with an error that is constant over four residuals, a hundred times."""
     jacobian = np.repeat(rng.normal(size=(100, 3)), 4, axis=0)
     truth = rng.normal(scale=4.0, size=3)
     measured = jacobian @ truth + np.repeat(rng.normal(size=100), 4)
@@ -255,7 +257,7 @@ def test_time_blocks_are_contiguous_and_of_one_column_each():
     np.testing.assert_array_equal(ids, [*second, *(5 + i for i in second), 10, 10, 10, 11, 11, 11])
 
 
-def test_time_blocks_take_the_length_asked_for():
+def test_time_blocks_have_the_configured_length():
     np.testing.assert_array_equal(time_blocks([(1, 8)], [4.0], block=2.0), [0, 0, 0, 0, 1, 1, 1, 1])
     uneven = time_blocks([(1, 100)], [7.0], block=1.0)
     sizes = np.bincount(uneven)
@@ -267,7 +269,7 @@ def test_a_channel_shorter_than_half_a_block_is_one_block_per_column(duration):
     np.testing.assert_array_equal(time_blocks([(3, 4)], [duration]), np.repeat([0, 1, 2], 4))
 
 
-def test_blocks_shorter_than_a_sample_put_each_sample_by_itself():
+def test_blocks_shorter_than_a_sample_hold_one_sample():
     ids = time_blocks([(2, 3)], [30.0])
     assert ids.shape == (6,) and len(set(ids.tolist())) == 6 and np.all(np.diff(ids) > 0)
 
@@ -277,11 +279,11 @@ def test_every_channel_needs_its_duration():
         time_blocks([(1, 3), (1, 3)], [1.0])
 
 
-# ---------------------------------------------------------------- what the data tell
+# ---------------------------------------------------------------- which parameters are identifiable
 
 
-def told():
-    """Four parameters left 12, 24.75, 26 and 98 % of their stated priors; p0 trades with p1 and p3.
+def four_verdicts():
+    """Four posteriors of 12, 24.75, 26 and 98 % of their stated priors; p0 is correlated with p1 and p3.
 
     Three have a prior four times as wide in the refinement, which counts for nothing here, one has a narrower one.
     """
@@ -293,15 +295,15 @@ def told():
     return identifiability(gaussian, np.array([4.0, 4.0, 0.5, 4.0]))
 
 
-def test_the_data_have_spoken_where_a_quarter_of_the_prior_is_left():
-    verdicts = told()
+def test_a_parameter_is_identifiable_below_a_quarter_of_its_prior():
+    verdicts = four_verdicts()
     assert [v.name for v in verdicts] == ["p0", "p1", "p2", "p3"]
     np.testing.assert_allclose([v.shrinkage for v in verdicts], [0.12, 0.2475, 0.26, 0.98])
     assert [v.identifiable for v in verdicts] == [True, True, False, False]
 
 
 def test_partners_are_those_of_strong_correlation_with_its_sign_the_strongest_first():
-    partners = [dict(v.partners) for v in told()]
+    partners = [dict(v.partners) for v in four_verdicts()]
     assert [list(p) for p in partners] == [["p3", "p1"], ["p0"], [], ["p0"]]
     assert partners[0] == pytest.approx({"p3": -0.75, "p1": 0.72})
     assert partners[3] == pytest.approx({"p0": -0.75})
@@ -314,45 +316,45 @@ def test_no_more_than_three_partners_are_named():
     assert [n for n, _ in identifiability(gaussian, np.full(6, 4.0))[0].partners] == ["p4", "p2", "p3"]
 
 
-def test_reasons_say_how_much_of_the_prior_is_left_and_partners_who_trades():
-    assert [[n for n, _ in v.partners] for v in told()] == [["p3", "p1"], ["p0"], [], ["p0"]]
-    reasons = [v.reason for v in told()]
+def test_reasons_state_the_shrinkage_and_partners_the_correlations():
+    assert [[n for n, _ in v.partners] for v in four_verdicts()] == [["p3", "p1"], ["p0"], [], ["p0"]]
+    reasons = [v.reason for v in four_verdicts()]
     assert reasons == [
         "the data narrow the prior to 12%",
         "the data narrow the prior to 25%",
-        "the data leave 26% of the prior's width",
-        "the data leave 98% of the prior's width",
+        "the data narrow the prior only to 26%",
+        "the data narrow the prior only to 98%",
     ]
 
 
-def test_how_far_the_fit_moved_each_is_in_deviations_of_its_stated_prior():
+def test_the_distance_from_the_prior_mean_is_in_deviations_of_the_stated_prior():
     space = space_of(2)
     for coordinates, mean in (("search", np.array([5.0, -0.5])), ("physical", space.from_search([5.0, -0.5]))):
         gaussian = Gaussian(space, mean, 0.09 * np.eye(2), "test", coordinates)
         assert [v.moved for v in identifiability(gaussian, np.full(2, 4.0))] == pytest.approx([5.0, -0.5])
 
 
-def test_what_the_data_do_not_see_keeps_its_prior_and_is_not_identifiable():
-    """From jacobian to verdict: p1 moves the residuals a thousand times less than its prior is wide."""
+def test_a_parameter_that_the_data_do_not_constrain_keeps_its_prior():
+    """From Jacobian to verdict: p1 hardly changes the residuals."""
     fit = fitted(SQUARE * [1.0, 1e-5])
     gaussian = calibrated(fit, [np.zeros((1, 16))], one_block(SQUARE))
-    seen, unseen = identifiability(gaussian, fit.prior)
-    assert seen.identifiable and seen.shrinkage == pytest.approx(1 / np.sqrt(200.0), rel=1e-3)
-    assert not unseen.identifiable and unseen.shrinkage == pytest.approx(
+    first, second = identifiability(gaussian, fit.prior)
+    assert first.identifiable and first.shrinkage == pytest.approx(1 / np.sqrt(200.0), rel=1e-3)
+    assert not second.identifiable and second.shrinkage == pytest.approx(
         4.0, abs=1e-4
     )  # as wide as the refinement let it
-    assert unseen.reason == "the data leave all of the prior's width"
+    assert second.reason == "the data do not narrow the prior"
 
 
 def test_a_posterior_as_wide_as_the_stated_prior_is_not_identifiable():
-    """However much narrower than the refinement's prior, four units, it is."""
+    """It is narrower than the refinement's prior of four units, which does not count."""
     gaussian = Gaussian(space_of(1), np.zeros(1), np.eye(1), "test", "search")
     (verdict,) = identifiability(gaussian, np.array([4.0]))
     assert not verdict.identifiable and verdict.shrinkage == 1.0
 
 
-def test_a_search_s_own_covariance_is_not_judged():
-    """However narrow it is."""
+def test_the_covariance_of_a_search_gives_no_verdict():
+    """This holds for any width."""
     space = space_of(3)
     narrow = dataclasses.replace(prior(space), cov=1e-6 * np.eye(3))
     verdicts = not_judged(narrow)
@@ -367,23 +369,23 @@ def test_a_parameter_without_any_effect_keeps_its_prior():
     np.testing.assert_allclose(np.sqrt(np.diag(g.cov)), [2 / np.sqrt(200), 4.0], rtol=1e-3)
 
 
-def test_what_is_not_seen_is_handed_on_as_wide_as_its_stated_prior():
-    """The refinement's own prior is four times as wide; what the data tell keeps its width and its partners."""
+def test_an_unconstrained_parameter_has_its_stated_prior_in_the_result():
+    """The refinement's prior is four times as wide.  Constrained parameters keep their width and correlations."""
     fit = fitted(SQUARE * [1.0, 0.0])
     wide = calibrated(fit, [exactly(2.0, 20, 16)], one_block(SQUARE))
     handed = with_stated_prior(wide, fit)
     np.testing.assert_allclose(np.sqrt(np.diag(handed.cov)), [2 / np.sqrt(200), 1.0], rtol=0.02)
     np.testing.assert_array_equal(handed.mean, wide.mean)
     skewed = fitted(100 * SKEW)
-    told = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
-    np.testing.assert_allclose(with_stated_prior(told, skewed).cov, told.cov, rtol=0.02)
+    constrained = calibrated(skewed, [exactly(2.0, 40, 30)], one_block(SKEW))
+    np.testing.assert_allclose(with_stated_prior(constrained, skewed).cov, constrained.cov, rtol=0.02)
     plain = fitted(SQUARE, width=1.0)  # none wider was used, nothing widened
     alone = calibrated(plain, [exactly(0.5, 20, 16)], one_block(SQUARE))
     np.testing.assert_allclose(with_stated_prior(alone, plain).cov, alone.cov, rtol=1e-9)
 
 
-def test_the_gaussian_to_hand_on_holds_the_stated_prior_and_the_blocks_of_a_second():
-    """One column of six seconds; what is left is constant within a second; the second parameter is not seen."""
+def test_the_result_combines_the_stated_prior_with_blocks_of_a_second():
+    """One column of six seconds with a residual that is constant within a second; p1 is not constrained."""
     count, per_second = 60, 10
     jacobian = np.stack([np.ones(count), np.zeros(count)], axis=1)
     residual = np.repeat([1.0, -1.0, 2.0, -2.0, 3.0, -3.0], per_second)
@@ -399,8 +401,8 @@ def test_the_gaussian_to_hand_on_holds_the_stated_prior_and_the_blocks_of_a_seco
     assert deviations(posterior(fit, [comparison]))[1] <= 1.0
 
 
-def test_a_poor_model_leaves_nothing_wider_than_what_was_stated_before():
-    """What is left over looks like both parameters: the data are widened, the prior is not."""
+def test_a_poor_model_makes_no_posterior_wider_than_its_stated_prior():
+    """The residual looks like both parameters: the data's information is widened, the prior is not."""
     jacobian = SQUARE * 0.5
     residual = 200.0 * jacobian[:, 0] + 200.0 * jacobian[:, 1]
     fit = fitted(jacobian, residual, nuisances=1)
@@ -411,7 +413,7 @@ def test_a_poor_model_leaves_nothing_wider_than_what_was_stated_before():
     assert (deviations(handed) <= 1.0 + 1e-9).all()
 
 
-def test_loud_repeats_never_leave_more_than_the_prior_of_what_is_not_seen():
+def test_noisy_repeats_do_not_widen_an_unconstrained_parameter_beyond_its_prior():
     fit = fitted(SQUARE * [1.0, 1e-5])
     g = calibrated(fit, [exactly(3.0, 20, 16)], one_block(SQUARE))
     assert identifiability(g, fit.prior)[1].shrinkage <= 4.004

@@ -32,7 +32,7 @@ TIME = np.arange(0, 12.0, 2e-3)
 
 
 def log(repeats: int, side: TorqueSide = TorqueSide.MOTOR) -> Recording:
-    """Two sines and the force they take, with noise of 0.05 N and 2 um."""
+    """Two sines and the force for them, with noise of 0.05 N and 2 um."""
     rng = np.random.default_rng(repeats)
     w = 2 * np.pi * np.array([0.31, 0.83])[:, None]
     size = np.array([[0.3], [0.1]])
@@ -49,7 +49,7 @@ def log(repeats: int, side: TorqueSide = TorqueSide.MOTOR) -> Recording:
 
 
 def another() -> Recording:
-    """Of another sensor, which shows 2 N more."""
+    """A log of another sensor, with an offset of 2 N."""
     recording = log(4)
     torque = recording.channels["torque"]
     channels = {**recording.channels, "torque": replace(torque, values=torque.values + 2.0)}
@@ -75,7 +75,7 @@ def found(scene: Scene, space: Space) -> Identified:
     return identify_parameters(scene, space, [log(1)], config=config)
 
 
-def test_mass_and_friction_come_back(found: Identified):
+def test_mass_and_friction_are_recovered(found: Identified):
     assert found.best == pytest.approx([MASS, DAMPING, COULOMB], rel=0.02)
     low, high = found.gaussian.interval(0.9)
     truth = np.array([MASS, DAMPING, COULOMB])
@@ -94,8 +94,8 @@ def test_the_last_third_in_time_is_held_out(found: Identified):
     assert found.fit.comparisons[0].channel("torque").unit == "N"
 
 
-def test_the_noise_of_one_repeat_is_what_the_fit_leaves(found: Identified):
-    """Stated twice, not by the search alone: about as many whitened residuals as are independent have size one."""
+def test_the_noise_of_one_repeat_is_estimated_from_the_residual(found: Identified):
+    """It is estimated twice, so that independent whitened residuals have about unit size."""
     assert found.refined is not None
     assert 0.02 < np.mean(found.refined.residual**2) < 1.5
 
@@ -124,7 +124,7 @@ def test_a_cost_of_two_recordings_is_that_of_each(scene: Scene, space: Space):
     assert both.first().whitened(rows).shape == each[0].whitened(rows).shape
 
 
-def test_every_recordings_gap_is_its_own(scene: Scene, space: Space):
+def test_every_recording_has_its_own_distance(scene: Scene, space: Space):
     config = IdentifyConfig(search=CmaConfig(population=8, parents=None, generations=2), samples=4)
     found = identify_parameters(scene, space, [log(3), another()], config=config)
     assert found.refined is not None and len(found.refined.residual) == found.fit.whitened(space.mean[None]).shape[1]

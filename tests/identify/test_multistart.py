@@ -21,7 +21,7 @@ def positive(name, mean, **kw):
 
 
 class Recorder:
-    """A residual function that keeps the rows it was asked."""
+    """A residual function that records its rows."""
 
     def __init__(self, function):
         self.function, self.asked = function, []
@@ -68,7 +68,7 @@ def test_a_linear_residual_gives_the_posterior_of_linear_regression():
 
 
 def test_the_prior_of_a_parameter_of_interest_is_as_wide_as_configured():
-    """One datum at 3 with deviation 1 against a prior of deviation w at 0: w^2 / (1 + w^2) of the way."""
+    """One datum at 3 of deviation 1, and a prior at 0 of deviation w: the posterior mean is 3 w^2 / (1 + w^2)."""
     for width in (0.5, 2.0):
         config = dataclasses.replace(EXACT, main_prior=width)
         fit = refine(linear([[1.0]], [3.0]), Space((line("a"),)), [0.0], config)
@@ -79,21 +79,21 @@ PRECISE, WEAK = 3e4, 5.0
 
 
 def two_masses():
-    """2 m1 + 5 m2 is seen precisely, m1 weakly; the truth, m1 = 3.5 and m2 = 0.1, leaves no residual."""
+    """2 m1 + 5 m2 is measured precisely, m1 poorly; the residual is zero at the truth, m1 = 3.5 and m2 = 0.1."""
     matrix = np.array([[2.0 * PRECISE, 5.0 * PRECISE], [WEAK, 0.0]])
     return linear(matrix, matrix @ [3.5, 0.1])
 
 
-def test_logarithmic_parameters_that_trade_reach_the_truth_along_a_curved_valley():
-    """From m1 = 0.25, m2 = 1.4: the valley is straight in kg, but a right angle in logarithms."""
+def test_correlated_logarithmic_parameters_reach_the_truth_along_a_curved_valley():
+    """From m1 = 0.25, m2 = 1.4: the valley is straight in kg, but bends by a right angle in logarithms."""
     space = Space((positive("m1", 1.0), positive("m2", 1.0)))
     fit = refine(two_masses(), space, [0.25, 1.4], dataclasses.replace(FLAT, tolerance=1e-6))
     np.testing.assert_allclose(fit.best, [3.5, 0.1], rtol=1e-3)
     assert fit.converged
 
 
-def test_among_the_first_trials_is_the_whole_way_straight_in_physical_units():
-    """Residuals linear in kg leave nothing to do after one Gauss-Newton step straight in kg."""
+def test_the_first_candidates_include_the_full_step_straight_in_physical_units():
+    """If residuals are linear in kg, one Gauss-Newton step that is straight in kg reaches the optimum."""
     matrix = np.array([[20.0, 50.0], [10.0, -30.0]])
     recorder = Recorder(linear(matrix, matrix @ [3.5, 0.1]))
     space = Space((positive("m1", 3.0), positive("m2", 0.3)))
@@ -103,8 +103,8 @@ def test_among_the_first_trials_is_the_whole_way_straight_in_physical_units():
     assert np.min(np.max(np.abs(first / [3.5, 0.1] - 1), axis=1)) < 1e-4
 
 
-def test_a_parameter_on_its_bound_leaves_the_others_their_constrained_optimum():
-    """The free optimum lies beyond a's bound, and b and c trade with a."""
+def test_with_a_parameter_on_its_bound_the_others_reach_their_constrained_optimum():
+    """The unconstrained optimum is beyond a's bound, and b and c are correlated with a."""
     matrix = np.array([[3.0, 2.5, 0.0], [2.5, 3.0, 1.0], [0.0, 1.0, 2.0], [1.0, 1.0, 1.0]])
     target = matrix @ [4.0, -2.0, 1.0]
     space = Space((line("a", high=1.5), line("b"), line("c")))
@@ -116,7 +116,7 @@ def test_a_parameter_on_its_bound_leaves_the_others_their_constrained_optimum():
 
 
 @pytest.mark.parametrize("a", [0.0, 0.1, 8.8, 9.0])
-def test_differences_at_a_bound_are_divided_by_what_is_left_of_their_span(a):
+def test_differences_at_a_bound_are_divided_by_their_clipped_span(a):
     space = Space((line("a", low=0.0, mean=1.0, high=9.0), line("b")))
     matrix = np.array([[3.0, 2.5], [2.5, 3.0], [1.0, -1.0]])
     recorder = Recorder(linear(matrix, [1.0, 2.0, 3.0]))
@@ -138,7 +138,7 @@ def test_a_start_on_the_wrong_bound_leaves_it():
 
 
 def two_basins(values):
-    """Minima near s = 3 and at s = -3, which alone leaves no residual; g settles at 4 s in either."""
+    """Minima near s = 3 and at s = -3, where the residual is zero; g is 4 s at both."""
     s, g = values[:, 0], values[:, 1]
     return np.stack([2.0 * (s**2 - 9.0), 0.5 * (s + 3.0), 3.0 * (g - 4.0 * s)], axis=1)
 
@@ -146,8 +146,8 @@ def two_basins(values):
 BASINS = Space((line("s"), line("g", std=5.0)))
 
 
-def test_a_hypothesis_finds_the_lower_basin_that_descent_misses():
-    """With g still at 12 the point s = -3 is far worse than where the descent stood: g must settle first."""
+def test_a_hypothesis_finds_a_lower_basin_than_the_descent():
+    """With g = 12 the point s = -3 is far worse than the descent's: g must be fitted first."""
     plain = refine(two_basins, BASINS, [3.2, 12.0], FLAT)
     assert plain.best[0] == pytest.approx(3.0, abs=0.1) and plain.objective > 4.0
     there = 0.5 * np.sum(two_basins(np.array([[-3.0, plain.best[1]]])) ** 2)
@@ -169,7 +169,7 @@ def test_a_hypothesis_that_is_worse_changes_nothing():
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
 
 
-def test_hypotheses_are_tried_only_where_the_residuals_leave_doubt():
+def test_hypotheses_are_tried_only_if_the_residuals_are_large():
     plain = refine(two_basins, BASINS, [3.2, 12.0], FLAT)
     mean_square = np.mean(plain.residual**2)
     for doubt, end in ((1.01 * mean_square, plain.best), (0.99 * mean_square, [-3.0, -12.0])):
@@ -182,12 +182,12 @@ HOPPING = dataclasses.replace(FLAT, basin_hops=1, basin_hop_generations=1, basin
 
 
 def two_untold(values):
-    """The same two minima, told to half a deviation: from the upper one the way down leads through s = 0."""
+    """The same two minima, with a posterior of half a deviation: from the upper one the path down passes s = 0."""
     s, g = values[:, 0], values[:, 1]
     return np.stack([0.3 * (s**2 - 9.0), 0.5 * (s + 3.0), 3.0 * (g - 4.0 * s)], axis=1)
 
 
-def test_what_strayed_though_hardly_told_is_put_back_to_its_mean_and_followed_from_there():
+def test_a_distant_and_hardly_constrained_parameter_is_reset_and_fitted_again():
     recorder = Recorder(two_untold)
     stood = refine(two_untold, BASINS, [3.2, 12.0], FLAT)
     assert stood.best[0] == pytest.approx(2.5, abs=0.6) and stood.objective > 3.0
@@ -201,17 +201,17 @@ def test_what_strayed_though_hardly_told_is_put_back_to_its_mean_and_followed_fr
     ("space", "sharper"),
     [
         (Space((line("s", nuisance=True), line("g", std=5.0, nuisance=True))), 1.0),  # of no interest
-        (BASINS, 1000.0),  # told well
+        (BASINS, 1000.0),  # well constrained
         (Space((line("s", mean=2.5), line("g", mean=12.0, std=5.0))), 1.0),  # where they were expected
     ],
 )
-def test_nothing_else_is_put_back(space, sharper):
+def test_no_other_parameter_is_reset(space, sharper):
     recorder = Recorder(lambda v: sharper * two_untold(v))
     refine(recorder, space, [3.2, 12.0], HOPPING)
     assert not np.any(np.isclose(recorder.rows[:, 0], space.mean[0], rtol=0, atol=1e-9))
 
 
-def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
+def test_the_best_of_several_starts_is_the_result_and_all_final_objectives_are_reported():
     fit = refine(two_basins, BASINS, [[3.2, 12.0], [-3.3, -10.0]], dataclasses.replace(FLAT, pruning_ratio=(1e9,)))
     np.testing.assert_allclose(fit.best, [-3.0, -12.0], atol=1e-4)
     upper = refine(two_basins, BASINS, [3.2, 12.0], FLAT).objective
@@ -219,7 +219,7 @@ def test_the_best_of_several_starts_wins_and_each_says_where_it_ended():
 
 
 def test_starts_far_worse_than_the_best_are_dropped():
-    """The second start begins two hundred times as high; it takes part in the iterations that allow for that."""
+    """The second start begins two hundred times as high; it is dropped when the pruning ratio is lower."""
     starts = [[-8.0, -12.0], [20.0, 0.0]]
     heights = 0.5 * np.sum(two_basins(np.array(starts)) ** 2, axis=1)
     assert heights[1] > 20 * heights[0]
@@ -241,7 +241,7 @@ def stepped(values):
     return np.stack([a - 0.7, b + 0.4, np.sqrt(2 * on_top)], axis=1)
 
 
-def test_hops_get_past_steps_beside_the_optimum_that_no_derivative_sees():
+def test_basin_hops_pass_steps_that_derivatives_do_not_show():
     """The lowest point is the corner (1.9, -1.6): 1.2 deviations from the bowl's bottom in either direction."""
     space, config = Space((line("a"), line("b"))), dataclasses.replace(FLAT, tolerance=0.5)
     stuck = refine(stepped, space, [-1.0, 1.0], config)
@@ -254,8 +254,8 @@ def test_hops_get_past_steps_beside_the_optimum_that_no_derivative_sees():
     assert hopped.converged
 
 
-def test_a_model_that_is_far_from_the_data_is_left_where_it_stands():
-    """Mean square residuals there are about ten."""
+def test_there_are_no_basin_hops_for_a_model_far_from_the_data():
+    """The mean square of its residuals is about ten."""
     space, config = Space((line("a"), line("b"))), dataclasses.replace(FLAT, tolerance=0.5, basin_hop_misfit=3.0)
     stood, hopping = (
         refine(stepped, space, [-1.0, 1.0], dataclasses.replace(config, basin_hops=hops)) for hops in (0, 4)
@@ -265,12 +265,12 @@ def test_a_model_that_is_far_from_the_data_is_left_where_it_stands():
     assert hopping.converged
 
 
-def test_a_hop_that_finds_nothing_is_the_last():
+def test_a_hop_that_finds_no_better_basin_is_the_last():
     matrix, target = np.array([[2.0, 1.0], [1.0, 3.0], [1.0, -1.0]]), np.array([1.0, 2.0, 3.0])
     space = Space((line("a"), line("b")))
 
     def fit(hops):
-        config = dataclasses.replace(FLAT, basin_hops=hops, basin_hop_generations=3)
+        config = dataclasses.replace(FLAT, basin_hops=hops, basin_hop_generations=3, basin_hop_misfit=3.0)
         return refine(linear(matrix, target), space, [5.0, 5.0], config)
 
     none, one, four = fit(0), fit(1), fit(4)
@@ -287,7 +287,7 @@ APART, TOGETHER = 8.0 * np.sin(ANGLE), 0.08 * np.cos(2 * ANGLE)
 
 
 def rounded(values):
-    """Two parameters whose difference is seen well and whose sum is not; each replay rounds anew."""
+    """Two parameters whose difference is constrained and whose sum is not; each replay has another rounding error."""
     a, b = values[:, :1], values[:, 1:]
     rounding = ROUNDING * np.sin(1e7 * (np.sqrt(2.0 + ANGLE) * a + np.sqrt(3.0 + ANGLE) * b))
     return APART * (a - b) + TOGETHER * (a + b) + rounding
@@ -299,7 +299,7 @@ def deviation_of_the_sum(jacobian, prior):
     return np.sqrt(along @ np.linalg.inv(hessian) @ along)
 
 
-def test_slopes_over_the_posterior_s_width_do_not_take_rounding_for_information():
+def test_differences_over_the_posterior_width_do_not_take_rounding_for_information():
     config = dataclasses.replace(FLAT, tolerance=0.5, main_prior=50.0)
     space = Space((line("a"), line("b")))
     fit = refine(rounded, space, [0.3, 0.1], config)
@@ -326,7 +326,7 @@ def test_the_wide_slopes_of_a_smooth_residual_are_its_derivatives_averaged_over_
 # ---------------------------------------------------------------- the cheap part
 
 
-def test_the_cheap_part_sorts_the_starts_and_all_data_give_the_result():
+def test_starts_are_compared_on_the_cheap_part_and_the_result_is_of_all_data():
     """d = g - 4 s is 2 on the cheap part (3 deviations strong), -1 on the rest (4 strong): 2 / 25 on all data."""
 
     def part(values):
@@ -371,7 +371,7 @@ def test_a_start_that_fails_is_dropped_while_another_wins():
 
 
 def test_a_hypothesis_that_fails_is_dropped_while_another_wins():
-    """What lies beyond s = 50 cannot be replayed, and neither can steps from there be asked for."""
+    """Replays beyond s = 50 blow up, and so do steps from there."""
 
     def replayed(values):
         BASINS.check(values)
@@ -390,19 +390,19 @@ def test_a_start_that_fails_on_all_the_data_is_refused():
 
 
 def first_look(residuals, space, starts, slopes, config=None):
-    """One look by itself, over the space that it frees."""
+    """The values and objective of one look, over its free parameters."""
     (found,) = chords(residuals, [Look(space, np.array(starts), slopes, lambda rows: rows)], config)
     return found
 
 
-def test_a_first_look_from_where_nothing_can_be_replayed_stays_there():
+def test_a_first_look_does_not_move_if_all_replays_blow_up():
     values, objective = first_look(lambda v: np.full((len(v), 2), np.nan), BASINS, [[1.0, 2.0]], np.eye(2))
     np.testing.assert_allclose(values, [1.0, 2.0])
     assert np.isinf(objective)
 
 
 def test_a_first_look_begins_at_the_best_of_its_starts():
-    """Steps of two units at most lead no further than a few from the first; the second is nearly there."""
+    """Steps of at most two units do not reach the optimum from the first start; the second is close to it."""
     space, slopes = Space((line("a"),)), np.ones((1, 1))
     far, _ = first_look(linear(slopes, [40.0]), space, [[0.0]], slopes, RefineConfig(chords=3))
     assert 0.0 < far[0] < 10.0
@@ -411,20 +411,20 @@ def test_a_first_look_begins_at_the_best_of_its_starts():
     assert objective == pytest.approx(0.5 * 40.0**2 / 17, rel=1e-4)
 
 
-def test_a_first_look_tries_what_its_settings_say():
+def test_a_first_look_takes_the_configured_steps():
     recorder = Recorder(linear(np.ones((1, 1)), [40.0]))
     few = RefineConfig(dampings=(1e-2, 1e1, 1e3), lengths=(1.0,), chords=1)
     first_look(recorder, Space((line("a"),)), [[0.0]], np.ones((1, 1)), few)
     assert [len(rows) for rows in recorder.asked] == [1, few.trials] and few.trials == 6
 
 
-def test_first_looks_share_their_batches_and_each_ends_as_by_itself():
-    """Each frees one of two parameters.  The first is linear: after one batch its trials no longer pay."""
+def test_first_looks_share_batches_and_end_as_if_they_were_separate():
+    """Each frees one of two parameters.  The first is linear and converges after one batch."""
 
-    def apart(v: np.ndarray) -> np.ndarray:
+    def separate(v: np.ndarray) -> np.ndarray:
         return np.stack([v[:, 0] - 1.5, 10.0 * np.arctan(0.1 * (3.0 * v[:, 1] - 30.0))], axis=1)
 
-    recorder, slopes = Recorder(apart), np.diag([1.0, 3.0])
+    recorder, slopes = Recorder(separate), np.diag([1.0, 3.0])
     looks = [
         Look(Space((line(name),)), np.array([[0.0], [1.0]]), slopes[:, [k]], partial(with_zero, k))
         for k, name in enumerate("ab")
@@ -446,8 +446,8 @@ def with_zero(column: int, rows: np.ndarray) -> np.ndarray:
     return whole
 
 
-def test_a_trial_that_fails_is_not_taken():
-    """The first full step leads from -8 to 12; beyond 9 nothing can be replayed, the optimum is at 8."""
+def test_a_candidate_step_that_blows_up_is_not_taken():
+    """The first full step is from -8 to 12; replays beyond 9 blow up, and the optimum is at 8."""
     cliff = Recorder(lambda v: np.where(v > 9.0, np.nan, 30.0 * np.arctan(0.2 * (v - 8.0))))
     fit = refine(cliff, Space((line("a", std=10.0),)), [-8.0], dataclasses.replace(FLAT, step=0.05))
     assert np.any(cliff.rows > 9.0)
@@ -463,28 +463,28 @@ def test_a_start_outside_the_bounds_is_refused():
 
 
 def test_progress_rises_and_every_replay_is_counted():
-    """Through all stages: a cheap part, a hypothesis, all data, hops."""
-    cheap, full, seen = Recorder(two_basins), Recorder(two_basins), []
+    """The stages are a cheap part, a hypothesis, all data, and hops."""
+    cheap, full, reports = Recorder(two_basins), Recorder(two_basins), []
     config = RefineConfig(main_prior=1e6, basin_hop_generations=3)
-    fit = refine(full, BASINS, [3.9, 9.0], config, first=cheap, hypotheses=[{"s": -2.8}], progress=seen.append)
+    fit = refine(full, BASINS, [3.9, 9.0], config, first=cheap, hypotheses=[{"s": -2.8}], progress=reports.append)
     assert fit.evaluations == len(cheap.rows) + len(full.rows)
-    numbers = [p.iteration for p in seen]
+    numbers = [p.iteration for p in reports]
     assert len(numbers) > 3 and numbers[0] == 1 and np.all(np.diff(numbers) >= 1)
-    assert numbers[-1] == fit.iterations and {p.iterations for p in seen} == {config.iterations}
-    assert seen[-1].mean_square == pytest.approx(2 * fit.objective / 3, abs=1e-6)
+    assert numbers[-1] == fit.iterations and {p.iterations for p in reports} == {config.iterations}
+    assert reports[-1].mean_square == pytest.approx(2 * fit.objective / 3, abs=1e-6)
 
 
-def test_iterations_are_limited_and_then_nothing_has_converged():
+def test_iterations_are_limited_and_the_result_is_then_not_converged():
     """Rosenbrock's valley takes more than one Jacobian."""
 
     def rosenbrock(values):
         return np.stack([10.0 * (values[:, 1] - values[:, 0] ** 2), 1.0 - values[:, 0]], axis=1)
 
-    seen = []
+    reports = []
     start, few = [-1.2, 1.0], dataclasses.replace(FLAT, iterations=1)
-    fit = refine(rosenbrock, BASINS, start, few, progress=seen.append)
-    assert fit.iterations == 1 and len(seen) == 1 and not fit.converged
-    assert fit.objective > 0.1 and seen[0].mean_square == pytest.approx(np.mean(fit.residual**2), rel=1e-6)
+    fit = refine(rosenbrock, BASINS, start, few, progress=reports.append)
+    assert fit.iterations == 1 and len(reports) == 1 and not fit.converged
+    assert fit.objective > 0.1 and reports[0].mean_square == pytest.approx(np.mean(fit.residual**2), rel=1e-6)
     long = refine(rosenbrock, BASINS, start, FLAT)
     assert long.converged and 1 < long.iterations < FLAT.iterations
     np.testing.assert_allclose(long.best, 1.0, atol=1e-3)
@@ -497,8 +497,8 @@ def test_a_failed_replay_within_the_posterior_does_not_end_the_refinement():
     np.testing.assert_allclose(fit.best, [0.0, 1.0], atol=1e-3)
 
 
-def test_a_fit_that_nothing_around_it_can_be_replayed_beside_is_kept():
-    """A hop draws far from where the iterations stood still, and finds no number there."""
+def test_a_fit_is_kept_if_all_replays_around_it_blow_up():
+    """A hop draws far from the converged point, where all replays blow up."""
     inside = linear(np.eye(2), [0.0, 1.0])
     near = Recorder(lambda v: np.where(np.linalg.norm(v - [0.0, 1.0], axis=1, keepdims=True) > 0.02, np.nan, inside(v)))
     fit = refine(near, BASINS, [0.01, 1.0], dataclasses.replace(FLAT, basin_hops=2, step=1e-3))
@@ -506,7 +506,7 @@ def test_a_fit_that_nothing_around_it_can_be_replayed_beside_is_kept():
     assert fit.converged and np.any(np.linalg.norm(near.rows - [0.0, 1.0], axis=1) > 0.1)
 
 
-def test_blown_up_replays_next_door_are_no_information():
+def test_replays_nearby_that_blow_up_are_no_information():
     matrix = np.array([[5.0, 1.0], [1.0, 4.0], [2.0, 2.0]])
     solved = linear(matrix, matrix @ [0.0, 1.0])
     fit = refine(lambda v: np.where(v[:, :1] > 0.03, np.nan, solved(v)), BASINS, [-1.0, 0.0], FLAT)
@@ -517,7 +517,7 @@ def test_blown_up_replays_next_door_are_no_information():
 
 
 def test_a_replay_that_blows_up_on_one_recording_of_two_is_no_information():
-    """Of b nothing is known: one side of its difference blows up on the second recording only, and that is no slope."""
+    """b is not constrained: one side of its difference blows up on the second recording, which is no slope."""
     matrix = np.array([[5.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     solved = linear(matrix, matrix @ [0.0, 0.0])
 
@@ -534,7 +534,7 @@ def test_a_replay_that_blows_up_on_one_recording_of_two_is_no_information():
         refine(lambda v: np.concatenate([solved(v), np.full((len(v), 3), np.nan)], axis=1), BASINS, [1.0, 0.0], FLAT)
 
 
-def test_what_a_hop_has_found_is_kept():
+def test_a_better_basin_is_kept():
     def step(v):
         return np.stack([v[:, 0] - 0.7, v[:, 1] + 0.4, np.sqrt(2 * np.where(v[:, 0] < 1.9, 2.0, 0.0))], axis=1)
 
@@ -543,8 +543,8 @@ def test_what_a_hop_has_found_is_kept():
     assert fit.objective < 1.9  # 0.72 is found by the hop, 2.0 returned
 
 
-def test_an_aim_that_is_out_of_reach_is_given_up_and_one_within_reach_is_pursued():
-    """A quartic valley gains ever less: half a million of an objective is never reached at its pace, the bottom is."""
+def test_a_target_objective_out_of_reach_is_given_up_and_one_within_reach_is_not():
+    """In a quartic valley the decrease becomes smaller and smaller: a distant target is not reached, the bottom is."""
     space = Space((line("a", 0.0, 1.0),))
 
     def quartic(values):

@@ -69,7 +69,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(tmp_path_factory.mktemp("neutral"), VALUES)
 
 
-def test_the_file_is_the_users_own(made: Made):
+def test_the_file_is_that_of_the_user(made: Made):
     mjcf = made.fit["mjcf"]
     assert mjcf["in_place"], mjcf["reason"]
     own, text = SCENE.read_text().splitlines(), (made.folder / "fitted.xml").read_text().splitlines()
@@ -85,7 +85,7 @@ def test_the_file_is_the_users_own(made: Made):
 @pytest.mark.parametrize("sample", [None, 3])
 @pytest.mark.parametrize("file", ["own", "fitted"])
 def test_numbers_are_written_into_spec_and_model(made: Made, sample: int | None, file: str):
-    """Whether the target is the user's file or the fitted one, in which a law may stand as a number already."""
+    """The target is the user's file or the fitted one, which may express a law as a number already."""
     path = SCENE if file == "own" else made.folder / "fitted.xml"
     spec, model = mujoco.MjSpec.from_file(str(path)), mujoco.MjModel.from_xml_path(str(path))
     values = apply_fit.apply(spec, made.fit, sample)
@@ -101,7 +101,7 @@ def test_numbers_are_written_into_spec_and_model(made: Made, sample: int | None,
 
 
 def test_a_batch_holds_the_draws_that_apply_writes(made: Made):
-    """Row by row, in every field; a field that no draw changes is left out, and the model stays as it was."""
+    """Row by row, in every field; fields that no draw changes are missing, and the model is unchanged."""
     model = mujoco.MjModel.from_xml_path(str(SCENE))
     damping = model.dof_damping.copy()
     fields = apply_fit.batch(model, made.fit, 5, seed=2)
@@ -117,7 +117,7 @@ def test_a_batch_holds_the_draws_that_apply_writes(made: Made):
 
 
 def test_a_batch_finds_the_robot_in_a_larger_scene(made: Made):
-    """Under a prefix; a nameless element, whose number is another there, is refused."""
+    """Names have a prefix there.  An element without a name is refused, since its number differs."""
     scene, robot = mujoco.MjSpec(), mujoco.MjSpec.from_file(str(SCENE))
     scene.option = robot.option
     scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1])
@@ -136,7 +136,7 @@ def test_a_batch_finds_the_robot_in_a_larger_scene(made: Made):
 
 
 def test_draws_are_those_of_the_gaussian(made: Made):
-    """Mean and covariance of 100 draws within four sampling errors; draw 7 is draw 7 however it is asked for."""
+    """Mean and covariance of 100 draws agree within four sampling errors; draw 7 is the same in every call."""
     few = made.space.to_search(apply_fit.draws(made.fit, range(100), seed=1))
     many = made.space.to_search(made.gaussian.sample(0, 20_000))
     spread = many.std(axis=0)
@@ -151,7 +151,7 @@ def test_draws_are_those_of_the_gaussian(made: Made):
 
 
 def test_a_gaussian_beyond_its_bounds_is_drawn_inside(made: Made):
-    """Where hardly a row of the normal lies within the bounds."""
+    """Hardly any row of the normal is inside the bounds."""
     fit = json.loads(json.dumps(made.fit))
     k, p = made.space.index("drag"), made.space["drag"]
     fit["gaussian"]["mean"][k] = -9.0 * p.std
@@ -210,7 +210,7 @@ def test_laws_name_their_variables(made: Made):
     assert drag["error"] < 1e-3 * made.values[made.space.index("drag")] * drag["axes"][0]["nodes"][-1] ** 2
 
 
-def test_a_law_that_has_no_table_is_named_and_nothing_is_lost(made: Made):
+def test_a_law_without_a_table_is_listed_and_the_others_are_written(made: Made):
     """One that depends on two joints, and one that fails."""
 
     def of_two(theta: Any, state: Any) -> Any:
@@ -227,14 +227,14 @@ def test_a_law_that_has_no_table_is_named_and_nothing_is_lost(made: Made):
 
 
 def table_of(made: Made, name: str, values: dict[str, float]) -> LawTable | NoTable:
-    """Of an effect of the library at one joint, at values that are known."""
+    """The table of an effect of the library at one joint, at given values."""
     found = list(law_tables(made.scene, made.scene.mjx, library(made.scene, [name]), values, {}))
     assert len(found) == 1
     return found[0]
 
 
-def test_a_law_of_load_goes_as_far_as_loads_do(made: Made):
-    """Where no force limit says how far; it stopped at 20 N m without a word."""
+def test_the_table_of_a_law_of_load_covers_the_loads(made: Made):
+    """There is no force limit that sets the range."""
     table = table_of(made, "load_friction", {"load_friction[elbow]": 0.1})
     assert isinstance(table, LawTable) and table.axes[0].name == "load" and table.error < 1e-3
     np.testing.assert_allclose(np.interp([0.05, 300.0], table.axes[0].nodes, table.terms[0][1]), [0.05, 300.0])
@@ -248,13 +248,13 @@ LATCH = {"latch_torque": 0.2, "latch_width": 0.01, "latch_exponent": 2.5}
     ("name", "values", "variable"), [("joint_stribeck", STRIBECK, "speed"), ("latch", LATCH, "position")]
 )
 def test_a_law_that_acts_in_a_narrow_range_has_a_table(made: Made, name: str, values: dict[str, float], variable: str):
-    """Friction within some mrad/s, a latch within a hundredth of a radian: no probe came so near."""
+    """Friction within some mrad/s, a latch within a hundredth of a radian."""
     table = table_of(made, name, values)
     assert isinstance(table, LawTable) and table.axes[-1].name == variable
 
 
 def test_a_ripple_has_a_table_where_its_periods_have_nodes(made: Made):
-    """Two nodes a period were nothing like it, and nothing said so; at all of them a ripple may be zero, too."""
+    """Two nodes per period are too few: a ripple may be zero at all of them."""
     ripple = {"ripple_sine[elbow]": 0.3, "ripple_periods": 64.0}
     table = table_of(made, "torque_ripple", ripple)
     assert isinstance(table, LawTable) and table.error < 0.03
@@ -281,8 +281,8 @@ GEARED = {"gear_motor[elbow]": 0.2, "gear_links[elbow]": 0.1, "gear_at_rest[elbo
         ("gear_friction", GEARED, "what motor and links put onto the gear"),
     ],
 )
-def test_why_a_law_has_no_table_is_said_in_words(made: Made, name: str, values: dict[str, float], why: str):
-    """Not as the error of a program that took a row for a number, or nothing for a gear."""
+def test_the_reason_why_a_law_has_no_table_is_stated(made: Made, name: str, values: dict[str, float], why: str):
+    """The reason is a sentence, not an exception's text."""
     none = table_of(made, name, values)
     assert isinstance(none, NoTable) and why in none.why
 
@@ -298,8 +298,8 @@ def test_commands_come_late(made: Made):
 
 
 @pytest.mark.parametrize(("name", "size"), [("profile_acceleration", 0.05), ("profile_speed", 0.9)])
-def test_a_servo_draws_its_own_ramps(made: Made, tmp_path: Path, name: str, size: float):
-    """As the effect does to a command on the replay's clock; once more where the simulation starts over."""
+def test_a_servo_follows_its_profile(made: Made, tmp_path: Path, name: str, size: float):
+    """The goal equals that of the effect in a replay, also after the simulation is reset."""
     (effect,) = effects = library(made.scene, [name])
     space = effect_space(effects).select([f"{name}[elbow]"])
     write_neutral(tmp_path, made.scene, prior(space), np.array([size]), effects, main="fitted.xml")
@@ -344,8 +344,8 @@ def test_it_runs_without_jax_and_the_laws_act(made: Made, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_it_moves_as_the_replay_does(made: Made, tmp_path: Path):
-    """The replay in MJX by C's own first-order steps, which it agrees with to float32."""
+def test_the_motion_equals_that_of_the_replay(made: Made, tmp_path: Path):
+    """The replay in MJX with first-order steps agrees with C up to float32."""
     answer, drive = replayed(made, tmp_path)
     seen = tuple(replace(e, observe=None) for e in made.effects)
     replay = servo_replay(made.scene, drive, seen, parity=True, late=0.0)
@@ -360,7 +360,7 @@ def test_it_moves_as_the_replay_does(made: Made, tmp_path: Path):
 
 
 def test_a_friction_law_starts_from_the_fits_number_each_time(made: Made):
-    """Whatever an earlier law left in the model; a draw after the other."""
+    """It does not depend on what an earlier law wrote into the model."""
     model = mujoco.MjModel.from_xml_path(str(SCENE))
     data = mujoco.MjData(model)
     data.qvel[:] = 1.0
@@ -382,7 +382,7 @@ ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
 
 
 def fit_of_rod(folder: Path, entries: list[dict[str, Any]], motor: str = "", effects: Sequence[str] = ()) -> Any:
-    """A fit of the rod half a deviation off its prior, as fitted.json, with its scene."""
+    """fitted.json of a rod half a deviation from its prior mean, and its scene."""
     (folder / "rod.xml").write_text(ROD.format(motor=motor))
     (folder / "parameters.json").write_text(json.dumps(entries))
     scene = load_scene(folder / "rod.xml", hold=True)
@@ -409,7 +409,7 @@ def test_friction_that_the_fit_held_is_held_where_it_is_applied(tmp_path: Path):
     np.testing.assert_allclose(spec.compile().dof_solimp, written.dof_solimp, rtol=1e-6)
 
 
-def test_a_batch_finds_whole_inertias_by_their_prefix(tmp_path: Path):
+def test_a_batch_finds_full_inertias_by_their_prefix(tmp_path: Path):
     fit, _ = fit_of_rod(tmp_path, [{"inertia": "rod", "std": 0.2}])
     house = mujoco.MjSpec()
     frame = house.worldbody.add_frame()
@@ -419,8 +419,8 @@ def test_a_batch_finds_whole_inertias_by_their_prefix(tmp_path: Path):
     np.testing.assert_allclose(found["body_mass"][:, -1], alone["body_mass"][:, -1])
 
 
-def test_a_geom_that_grew_is_found_by_contacts(tmp_path: Path):
-    """Its bound is that of the compiler, and the body keeps its fitted weight."""
+def test_a_larger_geom_makes_contacts(tmp_path: Path):
+    """Its bounding box is that of the compiler, and the body keeps its fitted mass."""
     size = {
         "field": "geom_size",
         "element": "tip",
@@ -473,7 +473,7 @@ def test_another_file_is_refused(tmp_path: Path, made: Made):
 
 
 def test_a_prior_of_the_built_in_door_has_its_table(tmp_path: Path):
-    """A scene that is no file: the whole MJCF, and rows by the ids of its geoms."""
+    """A scene without a file: the MJCF is complete, and rows have the ids of its geoms."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
 
@@ -490,7 +490,7 @@ def test_a_prior_of_the_built_in_door_has_its_table(tmp_path: Path):
     np.testing.assert_allclose(model.body_mass, expected.body_mass, rtol=1e-6)
 
 
-def test_a_scene_that_only_the_c_engine_has_is_written_too(tmp_path: Path):
+def test_a_scene_that_only_plain_c_supports_is_written_too(tmp_path: Path):
     """An integrator that MJX lacks."""
     text = SCENE.read_text().replace('integrator="implicitfast"', 'integrator="RK4" cone="elliptic"')
     (tmp_path / "bench.xml").write_text(text)

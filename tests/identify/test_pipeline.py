@@ -44,7 +44,7 @@ def repeats(count: int, seed: int = 0, noise: float = 0.3) -> np.ndarray:
     return wave + np.random.default_rng(seed).normal(0, noise, (count, 4000, 2))
 
 
-def test_what_is_no_recording_is_refused():
+def test_values_that_are_no_recording_are_refused():
     scene = elbow()
     with pytest.raises(ValueError, match="no recording to fit"):
         identify_parameters(scene, elbow_space(scene), [])
@@ -56,13 +56,13 @@ NORM = 0.3 * np.sqrt(np.pi / 2)  # mean norm of two normal numbers of deviation 
 
 
 @pytest.mark.parametrize("count", [2, 3, 10])
-def test_the_floor_is_what_the_noise_leaves_of_the_truth(count: int):
+def test_the_noise_floor_is_the_distance_of_the_truth(count: int):
     values = repeats(count)
     assert _scatter(values, np.ones(values.shape, bool)) == pytest.approx(NORM, rel=0.02)
 
 
-def test_what_was_not_measured_lowers_no_floor():
-    """Whole stretches of single repeats and half of all samples are missing; one repeat alone knows nothing."""
+def test_missing_samples_do_not_lower_the_noise_floor():
+    """Stretches of single repeats and half of all samples are missing; one repeat has no floor."""
     values = repeats(4)
     mask = np.repeat(np.random.default_rng(1).random((4, 4000, 1)) > 0.5, 2, axis=2)
     mask[0, :2000] = False
@@ -73,7 +73,7 @@ def test_what_was_not_measured_lowers_no_floor():
     assert _scatter(values, alone) is None
 
 
-def test_every_compared_channel_has_its_share_of_the_floor():
+def test_the_noise_floor_includes_every_compared_channel():
     scene, recording = elbow(), elbow_log(0.0, seconds=8.0, repeats=5)
     torque = recording.channels["torque"]
     fast = np.random.default_rng(3).normal(0, 0.02, torque.values.shape) + np.sin(torque.time)[:, None]
@@ -86,7 +86,7 @@ def test_every_compared_channel_has_its_share_of_the_floor():
     assert _floor(together) == pytest.approx(_floor(alone) + share, rel=0.02)
 
 
-def test_a_gap_that_is_hardly_there_was_not_closed():
+def test_the_closed_share_is_undefined_close_to_the_noise_floor():
     assert _closed(2.0, 1.0, 1.0) == 1.0 and _closed(2.0, 1.5, 1.0) == 0.5
     for before in (1.0, 1.0 + 0.5 * WORTH, 0.3):
         assert _closed(before, 0.9, 1.0) is None
@@ -100,7 +100,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Identified:
-    """Two repeats, of which one is fitted and one held out; whitened."""
+    """A fit of one of two repeats, with whitened residuals; the other is held out."""
     config = dataclasses.replace(QUICK, compare=CompareConfig(whitened=True))
     folder = tmp_path_factory.mktemp("checkpoints")
     return identify_parameters(
@@ -108,7 +108,7 @@ def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Identified:
     )
 
 
-def test_two_repeats_know_their_floor(found: Identified):
+def test_two_repeats_have_a_noise_floor(found: Identified):
     gap = found.heldout_distances["elbow"]
     recording = elbow_log(COULOMB, 10.0, 2)
     torque = recording.channels["torque"].values[:, :, 0]
@@ -132,14 +132,14 @@ def test_traces_and_joints_are_of_the_held_out_repeat(found: Identified):
     assert gap.per_joint_noise_floor == pytest.approx([np.sqrt(np.mean(apart**2) / 2)], rel=0.02)
 
 
-def test_the_settings_that_decided_are_in_the_result(found: Identified, tmp_path: Path):
+def test_the_settings_are_in_the_result(found: Identified, tmp_path: Path):
     write_run(tmp_path, found, {"recordings": []})
     config = json.loads((tmp_path / "fit.json").read_text())["config"]
     assert config == config_json(found.config) and config["search"]["population"] == 8
     assert config["compare"]["noise"]["cutoff"] == 8.0 and config["identifiability"]["identifiable"] == 0.25
 
 
-def test_the_command_says_how_it_went_and_what_to_do(found: Identified, tmp_path: Path, capsys):
+def test_the_command_prints_the_result_and_advice(found: Identified, tmp_path: Path, capsys):
     write_run(tmp_path, found, {"recordings": []})
     fit = json.loads((tmp_path / "fit.json").read_text())
     (name,) = fit["heldout_distances"]
@@ -172,7 +172,7 @@ def test_samples_are_of_both_gaussians_with_the_cost_of_each(found: Identified):
     assert np.median(drawn["fitted_cost"]) < np.median(drawn["initial_cost"])
 
 
-def test_the_refinement_also_begins_at_a_firm_grip_and_asks_which_fingers_slip():
+def test_the_refinement_has_a_start_with_a_firm_grip_and_hypotheses_of_slip():
     scene = door_scene()
     space = door_space(scene)
     searched: Any = SimpleNamespace(best=space.mean * 1.1)
@@ -191,7 +191,7 @@ def test_the_refinement_also_begins_at_a_firm_grip_and_asks_which_fingers_slip()
     assert len(starts(rest, rest, searched)) == 2 and grip_hypotheses(rest) == []
 
 
-def test_a_limit_that_acts_is_found_though_no_slope_at_zero_tells_of_it():
+def test_an_active_limit_is_a_start_since_its_derivative_at_zero_vanishes():
     limit = Parameter("limit", "s^2/rad", 0.0, 0.02, 0.0, 1.0)
     short, pull = replace(limit, name="short", mean=1.0), replace(limit, name="pull", low=-1.0)
     space = Space((replace(limit, name="damping", mean=0.5), limit, short, pull))
@@ -208,7 +208,7 @@ def test_a_limit_that_acts_is_found_though_no_slope_at_zero_tells_of_it():
 
 
 def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path: Path):
-    """A run whose samples fail keeps its fit, and does not count as whole."""
+    """A run whose samples fail keeps its fit, but is not complete."""
 
     def fails() -> dict[str, np.ndarray]:
         raise ValueError("no samples")
@@ -222,7 +222,7 @@ def test_files_are_written_before_samples_are_drawn(found: Identified, tmp_path:
     assert [p["name"] for p in fit["parameters"] if p["on_bound"]] == list(on_bound(found.full, found.best))
 
 
-def test_a_fit_that_makes_no_mjcf_keeps_everything_else(
+def test_a_fit_without_an_mjcf_writes_all_other_files(
     found: Identified, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     def refuses(*_: object) -> str:
@@ -238,7 +238,7 @@ def test_a_fit_that_makes_no_mjcf_keeps_everything_else(
     assert (tmp_path / "config.json").is_file() and not (tmp_path / "fitted.xml").exists()
 
 
-def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Identified, tmp_path: Path):
+def test_a_cost_in_noise_units_has_no_noise_floor_in_newton_metres(found: Identified, tmp_path: Path):
     write_run(tmp_path, found, {})
     fit = json.loads((tmp_path / "fit.json").read_text())
     assert fit["cost"]["unit"] == "noise units" and fit["cost"]["noise_floor"] is None
@@ -246,8 +246,8 @@ def test_a_floor_in_newton_metres_stands_beside_no_cost_in_noise_units(found: Id
 
 
 @pytest.mark.slow
-def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Path):
-    """Another scene, what is measured of it, comparison or prior of a nuisance is another cost."""
+def test_a_search_of_another_cost_is_not_resumed(scene: Scene, tmp_path: Path):
+    """The scene, its measured joints, the comparison, or the prior of a nuisance differs."""
     recording, space = elbow_log(COULOMB, 10.0, 2), elbow_space(scene)
     main, offset = space.select(["elbow_damping"]), space.select(["torque_offset[elbow]"])
 
@@ -273,13 +273,13 @@ def test_a_search_of_another_cost_is_not_gone_on_with(scene: Scene, tmp_path: Pa
 
 
 def test_positions_of_a_log_without_commands_are_refused_at_once(scene: Scene):
-    """Its replay moves as was measured: they would fit whatever the parameters are."""
+    """Its replay follows the measured positions, which would fit with any parameters."""
     config = dataclasses.replace(QUICK, compare=CompareConfig(channels={"position": 1.0}))
     with pytest.raises(ValueError, match=r"'elbow' holds no commands: .* only torques are simulated, so position"):
         identify_parameters(scene, elbow_space(scene), [elbow_log(0.0, 10.0, 2)], config=config)
 
 
-def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+def test_errors_in_held_out_data_are_raised_before_the_search(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     recording = elbow_log(0.0, 10.0, 2)
     torque = recording.channels["torque"]
     (held,) = split_repeats(recording, QUICK.heldout)[2]
@@ -293,8 +293,8 @@ def test_faults_of_what_is_held_out_are_told_before_the_search(scene: Scene, mon
         identify_parameters(scene, elbow_space(scene), [faulty], config=QUICK)
 
 
-def test_a_replay_that_blows_up_is_no_parent_whatever_the_others_cost(scene: Scene, monkeypatch: pytest.MonkeyPatch):
-    """Forces of kilonewtons cost more than what a blown-up replay is charged."""
+def test_a_replay_that_blows_up_is_never_a_parent(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    """The other rows cost more than a replay that blew up: their forces are kilonewtons."""
     asked = list[np.ndarray]()
 
     def search(cost, space, *_, **__):
@@ -346,7 +346,7 @@ def test_without_the_refinement_one_recording_is_fitted(scene: Scene):
 def test_every_replay_of_the_refinement_is_counted(
     scene: Scene, repeats: int, runs: int, monkeypatch: pytest.MonkeyPatch
 ):
-    """The noise of a single repeat is stated twice, with a refinement in between."""
+    """The noise of a single repeat is estimated twice, with a refinement in between."""
     counted = []
 
     def counting(*args, **options):
@@ -361,14 +361,14 @@ def test_every_replay_of_the_refinement_is_counted(
 
 
 @pytest.mark.parametrize(("repeats", "judged"), [(1, "time"), (3, "repeats")])
-def test_a_fit_says_what_it_is_judged_on(scene: Scene, repeats: int, judged: str):
+def test_a_fit_states_its_held_out_data(scene: Scene, repeats: int, judged: str):
     log = elbow_log(0.0, 9.0, repeats)
     assert judged_on(log, split_repeats(log, 0.3)[1]) == judged
     commanded = dataclasses.replace(log, time=np.arange(3.0), command=np.zeros((3, 1)), command_names=("elbow",))
     assert judged_on(commanded, split_repeats(commanded, 0.3)[1]) == ("repeats" if repeats > 1 else "same")
 
 
-def test_a_search_imports_nothing_that_it_may_not_need():
+def test_a_search_imports_no_optional_modules():
     """Checkpoints and distributions of scipy take seconds to import."""
     seen = "print('orbax' in sys.modules, 'scipy.stats' in sys.modules)"
     code = f"import sys, droid_jax.identify.search, droid_jax.identify.gaussian; {seen}"

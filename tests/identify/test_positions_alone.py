@@ -49,7 +49,7 @@ def fitted(logs: SimpleNamespace, one_line: None) -> Path:
 
 
 @pytest.mark.slow
-def test_parameters_come_back_from_positions_at_two_gains(fitted: Path):
+def test_parameters_are_recovered_from_positions_at_two_gains(fitted: Path):
     """The scene has a third gain: replayed with it, no damping and armature would fit both logs."""
     fit = json.loads((fitted / "fit.json").read_text())
     assert fit["compared"] == {"position": 1.0} and fit["distance_unit"] == "rad"
@@ -59,7 +59,7 @@ def test_parameters_come_back_from_positions_at_two_gains(fitted: Path):
 
 
 @pytest.mark.slow
-def test_the_fit_is_judged_on_the_recording_that_it_did_not_see(fitted: Path):
+def test_the_fit_is_evaluated_on_a_held_out_recording(fitted: Path):
     fit = json.loads((fitted / "fit.json").read_text())
     ((name, judged),) = fit["heldout_distances"].items()
     errors = judged["errors"]["position"]
@@ -75,7 +75,7 @@ def test_the_fit_is_judged_on_the_recording_that_it_did_not_see(fitted: Path):
 
 @pytest.mark.slow
 def test_a_fit_is_evaluated_on_any_recording(logs: SimpleNamespace, fitted: Path, capsys: pytest.CaptureFixture[str]):
-    """The errors of the judge are those of the fit's own file; a fitted recording is said to be one."""
+    """The errors of the held-out recording equal those in the fit's file; a fitted recording is marked."""
     out = logs.folder / "evaluation"
     save_recording(swung("torques", 2.0, 0.6, ("torque", "position")), torques := logs.folder / "torques.npz")
     given = [str(logs.judge), str(logs.soft), str(torques)]
@@ -113,7 +113,7 @@ def test_a_scene_that_changed_since_the_fit_is_noticed(
 
 
 def test_several_channels_count_in_units_of_their_noise(logs: SimpleNamespace):
-    """Two repeats tell the noise of each channel; one repeat weighs what the start leaves, alike."""
+    """The noise is estimated from two repeats, or from the residual at the start for one repeat."""
     scene, noise = pendulum(), 2e-3
     space = load_parameters(logs.folder / "parameters.json", scene)
     repeated = swung("ab", 1.0, 0.8, ("torque", "position"), noise, repeats=6)
@@ -156,8 +156,8 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     return SimpleNamespace(scene=scene, space=load_parameters(file, scene), logs=logs)
 
 
-def test_a_payload_that_is_known_of_each_log_is_taken_from_there(loaded: SimpleNamespace):
-    """Without it one mass is fitted to both, which leaves much of the loaded one."""
+def test_a_payload_that_each_log_states_is_used(loaded: SimpleNamespace):
+    """Without it one mass is fitted to both logs, with a large residual for the loaded one."""
 
     def fitted(logs: list[Recording]) -> Identified:
         search, still = CmaConfig(generations=2, population=4, parents=None), RefineConfig(basin_hops=0)
@@ -171,7 +171,7 @@ def test_a_payload_that_is_known_of_each_log_is_taken_from_there(loaded: SimpleN
 
 
 @pytest.mark.parametrize("whole", [False, True])
-def test_windows_and_whole_motions_take_what_is_known_of_their_log(loaded: SimpleNamespace, whole: bool):
+def test_windows_and_full_motions_use_the_values_that_their_log_states(loaded: SimpleNamespace, whole: bool):
     def made_of(logs: list[Recording]) -> WindowedLog:
         config = CompareConfig(channels={"position": 1.0})
         return windowed_log(loaded.scene, loaded.space, logs, config, WindowConfig(), whole=whole)
@@ -189,7 +189,7 @@ def test_windows_and_whole_motions_take_what_is_known_of_their_log(loaded: Simpl
 
 
 def test_a_parameter_stands_for_another_in_one_recording(loaded: SimpleNamespace):
-    """What the loaded log carries is fitted, and the empty one does not; one that no log asks for is refused."""
+    """The payload of the loaded log is fitted.  A parameter that no log refers to is refused."""
     empty, full = loaded.logs
     space = Space(
         (*loaded.space.parameters, replace(loaded.space["payload"], name="tool", writes=(), role=Role.STANDS_FOR))
@@ -202,7 +202,7 @@ def test_a_parameter_stands_for_another_in_one_recording(loaded: SimpleNamespace
         prepare(loaded.scene, space, loaded.logs, config=config)
 
 
-def test_what_is_known_must_be_a_parameter_within_its_bounds(loaded: SimpleNamespace):
+def test_stated_values_must_be_of_parameters_and_within_bounds(loaded: SimpleNamespace):
     log = loaded.logs[0]
     for known, said in (
         ({"load": 1.0}, "states load"),
@@ -216,7 +216,7 @@ def test_what_is_known_must_be_a_parameter_within_its_bounds(loaded: SimpleNames
 
 
 def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
-    """The search and the first refinement see the slow beginning, where the servo's own limit is out of reach."""
+    """The search and the first refinement use the slow beginning, which does not reach the servo's limit."""
     write_pendulum(tmp_path)
     scene, clock = pendulum(), np.arange(0.0, 4.0, 1 / RATE)
     waves = (
@@ -232,8 +232,8 @@ def test_a_limit_that_acts_at_the_end_of_a_log_is_found(tmp_path: Path):
     assert found.best == pytest.approx([*TRUE.values(), 1 / 16.0], rel=0.06)  # the optimum is 5.5 % off in damping
 
 
-def test_torques_that_hold_no_weight_are_left_out_of_an_evaluation(logs: SimpleNamespace):
-    """They cannot be compared where the joint feels a weight; the positions beside them can."""
+def test_torques_without_the_links_weight_are_left_out_of_an_evaluation(logs: SimpleNamespace):
+    """They cannot be compared if the joint carries a weight; the positions can."""
     scene = pendulum()
     space = load_parameters(logs.folder / "parameters.json", scene)
     both = swung("both", 1.0, 0.8, ("torque", "position"))
@@ -249,11 +249,11 @@ def test_torques_that_hold_no_weight_are_left_out_of_an_evaluation(logs: SimpleN
         evaluate_on(scene, space, alone, **of)
 
 
-def test_the_tests_pendulum_is_another_than_the_scenes():
+def test_the_pendulum_of_the_test_differs_from_the_scenes():
     assert {p["name"] for p in PARAMETERS} == set(TRUE) and all(TRUE[n] != START[n] for n in TRUE)
 
 
-def test_a_judge_whose_simulation_blows_up_is_refused_before_the_fit(logs: SimpleNamespace):
+def test_a_held_out_recording_whose_simulation_blows_up_is_refused_before_the_fit(logs: SimpleNamespace):
     soft = swung("soft", 1.0, 0.8)
     assert soft.gains is not None
     wild = replace(soft, name="wild", gains=replace(soft.gains, stiffness=soft.gains.stiffness * 1e9))

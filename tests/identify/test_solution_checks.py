@@ -33,7 +33,7 @@ def hinge(step: float) -> Scene:
 
 
 def recorded(side: TorqueSide = TorqueSide.MOTOR) -> Recording:
-    """What plain C logs at 0.1 ms, with a little noise."""
+    """A log of plain C with a time step of 0.1 ms, with a little noise."""
     fine = hinge(1e-4)
     time, data, rng = np.arange(0.0, 4.0, 0.01), mujoco.MjData(fine.model), np.random.default_rng(0)
     command, torque = 0.5 * np.sin(2 * np.pi * 0.7 * time), []
@@ -62,7 +62,7 @@ def checked(step: float, engine: str = "mjx", side: TorqueSide = TorqueSide.MOTO
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("engine", "step"), [("mjx", 0.002), ("mujoco", 0.0002)])
-def test_a_fine_time_step_is_measured_and_nothing_is_said(engine: str, step: float):
+def test_a_fine_time_step_is_measured_and_gives_no_note(engine: str, step: float):
     check = checked(step, engine)
     assert check.remaining == 0.01  # no less than noise can be
     assert check.discretisation is not None and check.discretisation < 1e-3
@@ -73,7 +73,7 @@ def test_a_fine_time_step_is_measured_and_nothing_is_said(engine: str, step: flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
-def test_a_time_step_that_is_too_coarse_is_said(engine: str):
+def test_a_coarse_time_step_gives_a_note(engine: str):
     check = checked(0.1, engine)
     assert check.too_coarse
     said = solution_notes({"swing": check}, "swing")
@@ -89,8 +89,8 @@ def test_half_a_step_is_taken_in_mjx_where_c_cannot_run_the_replay():
 
 
 @pytest.mark.slow
-def test_engines_that_differ_are_said():
-    """A polynomial stiffness that loading would have refused: C feels it, MJX does not."""
+def test_engines_that_differ_give_a_note():
+    """A polynomial stiffness, which loading would refuse: C applies it, MJX does not."""
     scene, recording = hinge(0.002), recorded()
     scene.model.jnt_stiffnesspoly[0] = [0.0, 30.0]
     cost, values = cost_of(scene, recording)
@@ -109,8 +109,8 @@ def test_data_of_mj_step_have_no_error_of_its_step():
 
 
 @pytest.mark.parametrize(("engine", "step"), [pytest.param("mjx", 0.02, marks=pytest.mark.slow), ("mujoco", 0.05)])
-def test_an_interval_is_as_wide_as_the_time_step_makes_it(engine: Literal["mjx", "mujoco"], step: float):
-    """The robot's step is 0.1 ms: the fit makes up for the scene's with another damping, and says so."""
+def test_an_interval_includes_the_error_of_the_time_step(engine: Literal["mjx", "mujoco"], step: float):
+    """The robot's time step is 0.1 ms: the fit compensates the scene's with another damping."""
     scene, recording, truth = hinge(step), recorded(), 0.9
     space = Space((joint_damping(scene, "j", std=0.5, high=10.0),))
     found = identify_parameters(scene, space, recording, config=replace(QUICK, engine=engine))
@@ -135,14 +135,14 @@ def test_a_log_without_commands_has_no_time_step():
     assert checks == {} and not off.any()
 
 
-def test_a_replay_that_blows_up_at_half_its_step_is_said():
+def test_a_replay_that_blows_up_at_half_its_step_gives_a_note():
     check = SolutionCheck(
         "N m", 0.1, 0.1, unmeasured="the simulation blows up at the fitted values with a step of 50 ms"
     )
     assert "do not trust the fitted values" in solution_notes({"a": check}, "swing")[0]
 
 
-def test_a_joint_that_creeps_with_the_fitted_friction_alone_is_said():
+def test_a_joint_that_creeps_only_with_the_fitted_friction_gives_a_note():
     spec = mujoco.MjSpec.from_string(HINGE.format(step=0.002))
     spec.actuators[0].set_to_motor()
     scene = compile_scene(spec, "swing", joints=["j"])
@@ -174,7 +174,7 @@ def rollout(position: np.ndarray) -> Rollout:
     return Rollout(time, position, position, velocity, still, np.zeros((len(time), 0), bool), np.array(False))
 
 
-def test_the_joint_that_leaves_its_range_first_is_named_with_what_its_servo_needs():
+def test_the_joint_that_leaves_its_range_first_is_named_with_its_stability_limit():
     path = np.zeros((50, 2))
     path[12:, 1] = 1e3
     path[20:] = np.nan
@@ -183,17 +183,17 @@ def test_the_joint_that_leaves_its_range_first_is_named_with_what_its_servo_need
     assert "need a time step well below" in said and "armature well above 0.002 kg m2" in said
 
 
-def test_a_joint_with_a_range_and_a_gentle_servo_is_named_alone():
+def test_a_joint_with_a_stable_servo_is_named_without_a_limit():
     path = np.zeros((50, 2))
     path[30:, 0] = 6.0
     assert blow_up(arm(), rollout(path)) == "shoulder leaves its range at step 30 (0.06 s)"
 
 
-def test_numbers_that_are_none_are_a_range_left():
+def test_a_position_that_is_not_finite_counts_as_out_of_range():
     path = np.zeros((50, 2))
     path[7:, 1] = np.nan
     assert blow_up(arm(), rollout(path)).startswith("wrist leaves its range at step 6")
 
 
-def test_a_replay_that_shows_nothing_is_not_explained():
+def test_a_replay_within_its_ranges_is_not_explained():
     assert blow_up(arm(), rollout(np.zeros((5, 2)))) == ""

@@ -1,6 +1,6 @@
 """Rehearsals: predicted sizes against the search's own tests on drawn residuals of a linear model; a driven hinge.
 
-On the hinge what has signal is said to be found and what has none is not; page, JSON, full form.
+On the hinge, effects with a signal are found and others are not; page, JSON and complete rehearsals.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from droid_jax.rehearsal.full import (
     scores,
     synthetic_log,
 )
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, leftover
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, unabsorbed
 from droid_jax.rehearsal.linearised import fine_steps, rehearsed
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import _some_flips, smallest_sizes
@@ -63,7 +63,7 @@ PLAN = RehearsalPlan(repeats=10, noise={"torque": 0.5}, channels=("torque",))
 
 
 def waves(rng: np.random.Generator, count: int) -> np.ndarray:
-    """[count, LENGTH] of slow random waves, as parameters change a torque."""
+    """Slow random waves [count, LENGTH], similar to sensitivities of a torque."""
     time = np.arange(LENGTH) / 20.0
     rates, starts = rng.uniform(0.05, 1.5, (5, count, 1)), rng.uniform(0, 2 * np.pi, (5, count, 1))
     return np.sin(2 * np.pi * rates * time + starts).sum(axis=0)
@@ -95,7 +95,7 @@ def of_blocks(**changes) -> LinearModel:
 
 
 def found(model: LinearModel, k: int, size: float, seed: int) -> bool:
-    """Whether the score test and the gain on other noise find direction k of a size, as the search makes them."""
+    """Whether the search's score test, and its validation test on other noise, find direction k of a size."""
     rng, count = np.random.default_rng(seed), model.repeats if model.repeated else 1
     part = model.train
     held = model.prior * count**0.5
@@ -127,8 +127,8 @@ def found(model: LinearModel, k: int, size: float, seed: int) -> bool:
 
 
 @pytest.mark.parametrize("make", [of_repeats, of_blocks])
-def test_the_smallest_size_is_found_nine_times_of_ten_and_half_of_it_seldom(make: Callable[..., LinearModel]):
-    """The oracle is the search's own score test and gain on drawn residuals (60: 4 % of deviation)."""
+def test_the_smallest_size_is_found_in_nine_of_ten_cases_and_half_of_it_rarely(make: Callable[..., LinearModel]):
+    """The oracle is the search's score and validation test on drawn residuals (60 draws: 4 % deviation)."""
     model = make()
     (size,) = smallest_sizes(model, [2], CONFIG)
     at = np.mean([found(model, 2, size.size, seed) for seed in range(CASES)])
@@ -137,7 +137,7 @@ def test_the_smallest_size_is_found_nine_times_of_ten_and_half_of_it_seldom(make
     assert below < 0.5
 
 
-def test_twice_as_many_repeats_find_what_is_smaller():
+def test_more_repeats_find_smaller_effects():
     """The noncentrality grows with the root of their number, and the threshold falls."""
     few, many = of_repeats(), of_repeats()
     (one,), (four,) = (smallest_sizes(m, [5], CONFIG) for m in (few, linear(few.train.rows, repeats=4 * REPEATS)))
@@ -145,7 +145,7 @@ def test_twice_as_many_repeats_find_what_is_smaller():
     assert many.repeats == REPEATS
 
 
-def test_bounds_and_minimum_sizes_decide_where_noise_does_not():
+def test_bounds_minimum_sizes_and_the_time_step_limit_what_is_found():
     (plain,) = smallest_sizes(of_repeats(), [1], CONFIG)
     (least,) = smallest_sizes(of_repeats(minimum=np.full(DIRECTIONS, 100.0)), [1], CONFIG)
     (bound,) = smallest_sizes(of_repeats(high=np.full(DIRECTIONS, 0.5 * plain.size)), [1], CONFIG)
@@ -156,8 +156,8 @@ def test_bounds_and_minimum_sizes_decide_where_noise_does_not():
     assert step.limit == "time step" and step.size > plain.size
 
 
-def test_what_the_base_parameters_absorb_is_not_found():
-    """A direction that is a base column leaves nothing but what its prior holds back."""
+def test_an_effect_that_the_base_parameters_absorb_is_not_found():
+    """The direction is a column of the Jacobian, so only its prior limits the absorption."""
     model = of_repeats()
     raw = model.train.raw.copy()
     raw[0] = model.train.base[:, 0]
@@ -174,21 +174,22 @@ def test_a_parameter_absorbs_an_effect_only_as_far_as_its_bounds():
     raw[0] = 10.0 * model.train.base[:, 0] + 0.3 * raw[0]
     part = LinearPart(raw, model.train.base, model.train.rows, model.train.channel)
     near = of_repeats(train=part, validation=part, base_low=np.full(BASE, -3.0), base_high=np.full(BASE, 3.0))
-    of, held = leftover(near, 0), near.held(1.0)
-    assert len(of.begins) > 1
+    part_of_effect, prior = unabsorbed(near, 0), near.prior_of_repeat(1.0)
+    assert len(part_of_effect.begins) > 1
     for size in (0.1, 0.5, 2.0):
-        columns, target = np.vstack([part.base, np.diag(1 / held)]), np.r_[size * raw[0], np.zeros(BASE)]
+        columns, target = np.vstack([part.base, np.diag(1 / prior)]), np.r_[size * raw[0], np.zeros(BASE)]
         fit = lsq_linear(columns, target, bounds=(-3.0, 3.0)).x
-        left = size * raw[0] - part.base @ fit
-        assert np.linalg.norm(of.at(size)[1] - left) < 1e-3 * np.linalg.norm(left)
-        assert of.size_of(np.array([np.linalg.norm(left)]), "validation")[0] == pytest.approx(size, rel=0.02)
+        residual = size * raw[0] - part.base @ fit
+        assert np.linalg.norm(part_of_effect.at(size)[1] - residual) < 1e-3 * np.linalg.norm(residual)
+        norm = np.array([np.linalg.norm(residual)])
+        assert part_of_effect.size_of(norm, "validation")[0] == pytest.approx(size, rel=0.02)
     unbounded = of_repeats(train=part, validation=part)
     (loose,), (tight,) = (smallest_sizes(m, [0], CONFIG) for m in (unbounded, near))
     assert tight.size < 0.8 * loose.size
 
 
-def test_alternatives_are_the_candidates_that_act_alike():
-    """Of two directions with a cosine of 0.99 each is taken for the other, up to a size; of others, none at it."""
+def test_alternatives_are_the_collinear_candidates():
+    """Two directions with a cosine of 0.99 are not distinguishable up to a size; the others are."""
     model = of_repeats()
     raw = model.train.raw.copy()
     raw[1] = raw[0] + 0.1 * raw[2] * np.linalg.norm(raw[0]) / np.linalg.norm(raw[2])
@@ -197,9 +198,9 @@ def test_alternatives_are_the_candidates_that_act_alike():
     (size,) = smallest_sizes(near, [0], CONFIG)
     others = alternatives_of(near, 0, size.size, DiscrepancyConfig(), CONFIG.share)
     assert others[0].key.effect == "effect1" and others[0].share > 0.9
-    assert size.size < others[0].apart < np.inf
-    apart = [r.key.effect for r in alternatives_of(near, 0, 2 * others[0].apart, DiscrepancyConfig(), CONFIG.share)]
-    assert "effect1" not in apart
+    assert size.size < others[0].distinguishable_from < np.inf
+    twice = 2 * others[0].distinguishable_from
+    assert "effect1" not in [r.key.effect for r in alternatives_of(near, 0, twice, DiscrepancyConfig(), CONFIG.share)]
     one_way = np.zeros(DIRECTIONS)
     low = of_repeats(train=part, validation=part, low=one_way, high=np.where(np.arange(DIRECTIONS) == 1, 1e-9, np.inf))
     assert "effect1" not in [
@@ -224,7 +225,7 @@ def hinge() -> tuple[Scene, Space]:
 
 @pytest.fixture(scope="module")
 def effects(hinge) -> tuple[Effect, ...]:
-    """The same for all: a program belongs to its effects."""
+    """Shared by all tests, since each set of effects is compiled."""
     return library(hinge[0], EFFECTS)
 
 
@@ -239,8 +240,8 @@ def entry(result: dict[str, Any], effect: str) -> dict[str, Any]:
     return next(e for e in result["effects"] if e["effect"] == effect)
 
 
-def test_what_has_signal_is_found_and_what_has_none_is_not(result):
-    """A preload of about the noise of one sample shows in ten repeats; a check beyond the motion in none."""
+def test_effects_with_a_signal_are_found_and_others_are_not(result):
+    """A preload of about the noise of one sample is found; a check beyond the motion is not."""
     assert 0 < entry(result, "hinge_preload")["smallest"] < 1.0
     assert not np.isfinite(entry(result, "opening_check")["smallest"])
     (damping,) = result["parameters"]
@@ -255,7 +256,7 @@ def test_an_effect_whose_other_law_looks_like_another_effect_is_doubtful(result)
     assert any("over centre spring" in s and "not named" in s for s in rehearsal_sentences(plain(result)))
 
 
-def test_slopes_of_one_batch_are_those_of_two():
+def test_one_batch_gives_the_jacobian_of_two_batches():
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(7, 2))
     space = Space(tuple(Parameter(n, "-", 0.0, 1.0, -0.5, 9.0) for n in "ab"))
@@ -269,8 +270,8 @@ def test_slopes_of_one_batch_are_those_of_two():
 
 
 @pytest.mark.slow
-def test_plain_c_in_fine_steps_tells_the_step_error(hinge, effects: tuple[Effect, ...]):
-    """The same order as the search's own, of the compiled replay at a quarter of its step."""
+def test_plain_c_with_fine_steps_gives_the_time_steps_error(hinge, effects: tuple[Effect, ...]):
+    """It is of the same size as the search's, which replays at a quarter of the time step."""
     scene, space = hinge
     recordings = [motion(), motion("validation", 1.0)]
     asked = (scene, space, effects, recordings, PLAN, DiscrepancyConfig(), CONFIG)
@@ -309,7 +310,7 @@ def test_a_faster_motion_lasts_as_long_and_ends_where_it_did():
     )
 
 
-def test_noise_of_a_log_is_read_from_row_to_row():
+def test_the_noise_of_a_log_is_estimated_from_second_differences():
     clean = motion().channel("position")
     rng = np.random.default_rng(0)
     noisy = replace(clean, values=clean.values + rng.normal(0, 1e-3, clean.values.shape))
@@ -341,16 +342,20 @@ def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[
     assert measured_size({"smallest": 3.0}, cases) == measured
 
 
-def test_advice_is_wrong_where_what_would_be_found_was_not():
+def test_advice_is_wrong_if_an_effect_was_not_found():
     usual = {"within": True, "not_found_at_twice": False, "missed": False, "found": {"1": [1, 1]}}
     of = [
         {**usual, "sure": True, "measured_over_predicted": 0.7},
         {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
         {**usual, "sure": False, "missed": True, "not_found_at_twice": True, "within": False},
     ]
-    told = summary({"hinge": of})
-    assert told["wrong_advice_rate"] == 0.5 and told["advised"] == 2 and told["within_factor"] == pytest.approx(2 / 3)
-    assert told["within_factor_of_sure"] == 1.0 and told["unsure_not_found"] == 1
+    result = summary({"hinge": of})
+    assert (
+        result["wrong_advice_rate"] == 0.5
+        and result["advised"] == 2
+        and result["within_factor"] == pytest.approx(2 / 3)
+    )
+    assert result["within_factor_of_sure"] == 1.0 and result["unsure_not_found"] == 1
 
 
 def test_one_case_of_five_has_nothing_hidden_and_sizes_stay_inside_bounds(hinge):
@@ -374,14 +379,14 @@ def test_scores_take_the_size_from_which_all_are_found():
     }
     of = [{**usual, "size": s, "found": s > 1.0} for s in (0.5, 1.0, 2.0, 4.0)]
     empty = {**usual, "effect": "", "effects": ["a"], "parameters": [{"name": "m", "recovered": True, "holds": False}]}
-    told = scores([*of, empty, {**empty, "verdict": "error"}], 0.9)
-    assert told["effects"][0]["smallest"] == 2.0 and told["failed"] == 1
-    assert told["nothing_hidden"] == {"cases": 1, "named": 1}
-    assert told["parameters"] == [{"name": "m", "cases": 1, "recovered": 1, "holds": 0}]
+    result = scores([*of, empty, {**empty, "verdict": "error"}], 0.9)
+    assert result["effects"][0]["smallest"] == 2.0 and result["failed"] == 1
+    assert result["nothing_hidden"] == {"cases": 1, "named": 1}
+    assert result["parameters"] == [{"name": "m", "cases": 1, "recovered": 1, "holds": 0}]
 
 
 def test_a_synthetic_log_holds_what_was_hidden_and_the_stated_noise(hinge):
-    """Of the synthetic robot's own preload, which is constant near the closed door."""
+    """The synthetic robot's preload is constant near the closed door."""
     scene, space = hinge
     asked = (scene, space, library(scene, EFFECTS), motion(), space.mean)
     rest = (PLAN, DiscrepancyConfig(channels=("torque",)), RehearsalConfig(), 3)
@@ -395,7 +400,7 @@ def test_a_synthetic_log_holds_what_was_hidden_and_the_stated_noise(hinge):
 
 
 def test_page_and_json_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], hinge, result, monkeypatch):
-    """The files; the answer itself is the module's."""
+    """The answer itself is patched with that of this module."""
     monkeypatch.setattr("droid_jax.rehearsal.quick.quick_rehearsal", lambda *args, **kwargs: (None, dict(result)))
     save_recording(motion(), tmp_path / "log.npz")
     (tmp_path / "parameters.json").write_text(json.dumps(PARAMETERS))
@@ -414,7 +419,7 @@ def test_page_and_json_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("given", "said"), [("torque", "--noise takes"), ("torque=-1", "--noise takes"), ("sound=1", "channels:")]
 )
-def test_noise_that_is_none(refused, tmp_path: Path, given: str, said: str):
+def test_invalid_noise_options_are_refused(refused, tmp_path: Path, given: str, said: str):
     assert said in refused("rehearse", "--noise", given, "--out", tmp_path / "run")
 
 
@@ -428,7 +433,7 @@ def test_the_benchmark_looks_for_the_smallest_size_that_is_found(known: dict[flo
 
 
 @pytest.mark.slow
-def test_complete_rehearsals_go_on_and_name_what_is_large(tmp_path: Path, hinge):
+def test_complete_rehearsals_resume_and_name_a_large_effect(tmp_path: Path, hinge):
     scene, space = hinge
     config = DiscrepancyConfig(search=CmaConfig(population=12, parents=None, generations=4), channels=("torque",))
     recordings, asked = (motion(), motion("validation", 1.0)), library(scene, EFFECTS[:2])
@@ -446,21 +451,21 @@ def test_complete_rehearsals_go_on_and_name_what_is_large(tmp_path: Path, hinge)
     assert nothing["effects"] == [] and [p["name"] for p in nothing["parameters"]] == ["door_damping"]
 
 
-def test_a_longer_log_asks_for_less_but_for_the_smallest_size_that_is_named():
+def test_a_longer_log_lowers_all_limits_but_the_minimum_effect_size():
     entry = {"minimum": 0.3, "limits": {"score test": 1.0, "minimum effect size": 0.5}}
     assert _of_longer_log(entry, 4.0) == pytest.approx(0.5)
     assert _of_longer_log(entry, 1e6) == pytest.approx(0.3, rel=1e-2)
 
 
 @pytest.mark.parametrize("count", [8, 11, 12, 30])
-def test_the_flips_of_a_prediction_turn_every_unit(count: int):
+def test_a_subset_of_the_sign_flips_flips_every_unit(count: int):
     flips = _some_flips(count, CONFIG)
     assert len(flips) <= CONFIG.flips and np.all(flips[0] == flips[0, 0])
     some, every = (np.mean(of == flips[0, 0], axis=0) for of in (flips, sign_flips(count, CONFIG.seed)))
     np.testing.assert_allclose(some, every, atol=0.12)
 
 
-def test_what_a_validation_recording_says_goes_by_its_own_repeats():
+def test_the_validation_part_has_its_own_number_of_repeats():
     few = Repeats(np.random.default_rng(5).normal(size=(4, LENGTH)))
     model = of_repeats()
     other = replace(model, validation=replace(model.validation, rows=few))

@@ -164,7 +164,7 @@ def test_what_is_left_at_rest_tells_nothing_of_noise():
     cost = make_cost(scene, space, [recording])
     moves = cost.comparisons[0].channel("torque").moves
     assert 0.5 < moves.mean() < 0.9
-    restated = cost.restated(space.mean)
-    noise = 1.0 / restated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
+    estimated = cost.with_estimated_noise(space.mean)
+    noise = 1.0 / estimated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
     left = cost.comparisons[0].channel("torque").noise.mean - cost.smoothed(space.mean[None])[0][0]
     assert noise >= np.sqrt(np.mean(left[moves] ** 2))
