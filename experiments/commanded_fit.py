@@ -39,7 +39,7 @@ def fitted(
     """fit.json of an identification, and the seconds that it took; one that is finished already is read."""
     began = time.monotonic()
     command(
-        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--judge-on", *judge, *options,
+        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--test-recording", *judge, *options,
          "--out", out]
     )  # fmt: skip
     assert (out / CONFIG).is_file()

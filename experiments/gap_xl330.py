@@ -51,7 +51,7 @@ def fold(config: GapXl330, paths: dict[str, Path], judge: int, motions: tuple[st
     began = time.monotonic()
     command(
         ["gap", "--scene", HERE / "xl330.xml", "--parameters", HERE / "xl330.json", "--recording", *train,
-         "--judge-on", *test, "--seed", str(config.seed), "--out", out]
+         "--test-recording", *test, "--seed", str(config.seed), "--out", out]
     )  # fmt: skip
     found = json.loads((out / GAP).read_text())
     return {

@@ -136,7 +136,7 @@ def searched(config: RealSo101) -> dict[str, Any]:
     fitted(scene_of(config.data), parameters, fit, judges, runs / "identify_24", [*own, *few])
     command(
         ["gap", "--scene", scene_of(config.data), "--parameters", parameters, *own, *options,
-         "--fit", runs / "identify_24", "--recording", *fit, "--judge-on", *judges, "--out", runs / "gap"]
+         "--fit", runs / "identify_24", "--recording", *fit, "--test-recording", *judges, "--out", runs / "gap"]
     )  # fmt: skip
     found = json.loads((runs / "gap" / GAP).read_text())
     mae = {

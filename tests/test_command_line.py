@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+import tyro
 from small_log import elbow_log, write_elbow
 
 from droid_jax import run
@@ -433,6 +434,13 @@ def test_an_option_of_the_synthetic_robot_beside_recordings(
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
     assert f"{option[0]} is for the synthetic robot, and --recording says that there is none" in said
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("command", [Identify, GapCommand])
+@pytest.mark.parametrize("option", ["--test-recording", "--judge-on"])
+def test_test_recordings_keep_their_earlier_option(command: type, option: str):
+    parsed = tyro.cli(command, args=["--recording", "a.npz", option, "b.npz", "c.npz"])
+    assert parsed.judge_on == (Path("b.npz"), Path("c.npz"))
 
 
 def test_options_of_the_synthetic_robot_are_filled_in_where_it_records():

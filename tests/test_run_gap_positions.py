@@ -59,7 +59,7 @@ def test_positions_of_one_commanded_log(
     logs = [swung("log", 1.0, 0.31, noise=NOISE, friction=FRICTION)]
     judge = swung("judge", 0.8, 0.43, noise=NOISE, friction=FRICTION)
     save_recording(judge, tmp_path / "judge.npz")
-    answer = found(tmp_path, logs, "--judge-on", str(tmp_path / "judge.npz"))
+    answer = found(tmp_path, logs, "--test-recording", str(tmp_path / "judge.npz"))
     assert answer.split.by == "windows" and "stretches of time" in answer.split.limits
     assert [d.recording for d in answer.discrepancies.values()] == [
         "log, every other block", "log, the blocks between", "judge",

@@ -16,6 +16,7 @@ from droid_jax.commands.options import (
     TIMESTEP,
     Channel,
     JointFriction,
+    TestRecordings,
     compared,
     load_effects,
     needs_log,
@@ -62,9 +63,10 @@ class GapCommand:
     log is test data. Of one motion less can be concluded, and the report says what.
 
     LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; stretches of all of them train and
-    validate in turns, and the last third of each is test data, or --judge-on."""
-    judge_on: tuple[Path, ...] = ()
-    """Commanded logs that are test data, beside others with few repeats."""
+    validate in turns, and the last third of each is test data, or --test-recording."""
+    judge_on: TestRecordings = ()
+    """Test data: commanded logs to which no model is fitted, beside others with few repeats. (Earlier name:
+    --judge-on.)"""
     replay: Literal["auto", "whole", "windows"] = "auto"
     """Commanded logs with few repeats. windows: replayed from measured states, each half a second long. whole: from
     their beginnings. auto: whole where a servo holds every joint; of more than two minutes, longer windows."""
@@ -309,10 +311,10 @@ def gap_config(command: GapCommand) -> DiscrepancyConfig:
 
 
 def given_to(command: GapCommand) -> list[Recording]:
-    """The recordings, those of --judge-on last; none where the synthetic robot shall record."""
+    """The given recordings, those of --test-recording last; empty if the synthetic robot is to be recorded."""
     needs_recording(command)
     if command.judge_on and not command.recording:
-        raise ValueError("--judge-on needs --recording: the synthetic robot records its own test data")
+        raise ValueError("--test-recording needs --recording: the synthetic robot records its own test data")
     return [recording_at(path) for path in (*command.recording, *command.judge_on)]
 
 

@@ -16,6 +16,7 @@ from droid_jax.commands.options import (
     Channel,
     JointFriction,
     Preset,
+    TestRecordings,
     compared,
     load_effects,
     needs_log,
@@ -54,9 +55,10 @@ class Identify:
     recording: tuple[Path, ...] = ()
     """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
     fitted together."""
-    judge_on: tuple[Path, ...] = ()
-    """Whole recordings to judge the fit on, which it does not see; all of --recording is then fitted. Default: the
-    last repeats judge, or the last part of a log without commands."""
+    judge_on: TestRecordings = ()
+    """Test data: whole recordings on which the fit is evaluated and to which it is not fitted. All repeats of
+    --recording are then fitted. Default: the last repeats are held out, or the last part of a log without commands.
+    (Earlier name: --judge-on.)"""
     compare: tuple[Channel, ...] = ()
     """Measured channels to fit; several are weighted by their noise. Default: torque, or where no torque was measured
     position (without it velocity) and the object's angle."""
@@ -301,7 +303,7 @@ def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:
     """
     needs_recording(command)
     if command.judge_on and not command.recording:
-        raise ValueError("--judge-on needs --recording: the synthetic robot is judged on its own repeats")
+        raise ValueError("--test-recording needs --recording: the synthetic robot is tested on its own repeats")
     files: dict[str, Path] = {}
     paths = (*command.recording, *command.judge_on)
     recordings = [recording_at(path) for path in paths]

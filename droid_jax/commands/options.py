@@ -8,7 +8,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+
+import tyro
 
 from droid_jax.report.stages import setup
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 Channel = Literal["torque", "position", "velocity", "object_angle"]
 Preset = Literal["quick", "standard", "paper", "gpu"]
 JointFriction = Literal["held", "scene"]
+# Kept as the field `judge_on`, by which setup.json of earlier runs knows it; --judge-on is its earlier name.
+TestRecordings = Annotated[tuple[Path, ...], tyro.conf.arg(name="test-recording", aliases=("--judge-on",))]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
 
 
