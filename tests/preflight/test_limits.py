@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.preflight.creep import STIFF, creep_note, creep_per_load, creeping
+from droid_jax.preflight.creep import HOLDING_SOLIMP, creep_note, creep_per_load, creeping
 from droid_jax.preflight.preflight import check_range, clipped_commands, command_notes, exceeded_torques
 from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
@@ -111,7 +111,7 @@ def crept(scene: Scene, torque: float) -> float:
     [
         (0.03, 'frictionloss="0.3"', ""),
         (0.002, 'frictionloss="0.3"', ""),
-        (0.03, f'frictionloss="0.3" solimpfriction="{STIFF}"', ""),
+        (0.03, f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="0.05 1" solimpfriction=".7 .8 .001 .5 2"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="-100 -40"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="0.001 1"', ""),
@@ -132,13 +132,13 @@ def test_a_joint_that_creeps_under_the_load_it_holds_is_said_beforehand():
     assert creep.speed == pytest.approx(7.04e-3, rel=0.02) and creep.distance == pytest.approx(0.070, rel=0.03)
     said = creep_note(scene, held)
     assert "j by 7 mrad/s at the 0.2 N m that it holds for 10 s (70 mrad in all" in said
-    assert f'solimpfriction="{STIFF}"' in said and said in command_notes(scene, held)
-    assert not creep_note(hinge(f'frictionloss="0.3" solimpfriction="{STIFF}"'), held)
+    assert f'solimpfriction="{HOLDING_SOLIMP}"' in said and said in command_notes(scene, held)
+    assert not creep_note(hinge(f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"'), held)
     assert not creep_note(hinge(), held)  # without friction nothing is held
 
 
 def test_of_a_scene_that_holds_it_is_said_what_its_mjcf_would_do():
-    hard = hinge(f'frictionloss="0.3" solimpfriction="{STIFF}"')
+    hard = hinge(f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"')
     still = log(np.full_like(TIME, 0.2), np.full_like(TIME, 0.2), np.zeros_like(TIME))
     said = creep_note(replace(hard, held=("j",)), still)
     assert "would creep in its MJCF" in said and "j by 7 mrad/s at the 0.2 N m" in said

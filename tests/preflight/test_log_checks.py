@@ -432,7 +432,7 @@ def test_a_small_inertia_beside_friction_in_another_unit():
     heavy = hinge(mass=3.0 / 0.03)
     assert check_log(heavy, opened(1.0, 3.0, 0.05)) == ()
     (milli,) = check_log(heavy, opened(1000.0, 3.0, 0.05))
-    assert milli.kind == "units" and "of what the motion takes: are these milliamperes" in milli.sentence
+    assert milli.kind == "units" and "times what the motion needs: are these milliamperes" in milli.sentence
 
 
 def test_a_column_that_was_never_measured_is_no_dead_one():
