@@ -39,8 +39,8 @@ def fitted(
     """fit.json of an identification, and the seconds that it took; one that is finished already is read."""
     began = time.monotonic()
     command(
-        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--test-recording", *judge, *options,
-         "--out", out]
+        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--test-recording", *judge,
+         *options, "--out", out]
     )  # fmt: skip
     assert (out / CONFIG).is_file()
     found = json.loads((out / FIT).read_text())

@@ -413,7 +413,7 @@ def test_the_same_name_twice(refused, tmp_path: Path):
 )
 def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: str, option: tuple[str, str]):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
-    assert f"{option[0]} is for a scene of your own: give --scene too" in said
+    assert f"{option[0]} is for your own scene: give --scene too" in said
     assert not (tmp_path / "run").exists()
 
 
@@ -432,7 +432,7 @@ def test_an_option_of_the_synthetic_robot_beside_recordings(
     refused, tmp_path: Path, command: str, option: tuple[str, str]
 ):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
-    assert f"{option[0]} is for the synthetic robot, and --recording says that there is none" in said
+    assert f"{option[0]} is for the synthetic robot, which is not recorded with --recording" in said
     assert not (tmp_path / "run").exists()
 
 

@@ -66,7 +66,7 @@ def test_a_run_that_nobody_listens_to_any_more_is_stopped(monkeypatch, capfd, tm
     (tmp_path / "talk.py").write_text(script)
     done = shell(f"set -o pipefail; {sys.executable} talk.py | head -n 1", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (141, "cost\n")
-    assert done.stderr == "stopped: nobody reads the output any more; the same command goes on from here\n"
+    assert done.stderr == "stopped: the output is no longer read; the same command goes on from here\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")

@@ -318,7 +318,7 @@ def test_a_damaged_file_is_named(called, tmp_path: Path, name: str, text: str):
         if name == "all.json":
             all_stages._remember(all_stages.All(), run)
         else:
-            all_stages.told(run)
+            all_stages.summary_lines(run)
 
 
 def test_another_runs_results_are_not_written_over(called, capsys):
@@ -413,7 +413,7 @@ def test_options_of_stages_that_are_left_out_are_refused(called, refused):
 def test_a_folder_of_identify_is_no_folder_of_all(called, refused, tmp_path: Path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "setup.json").write_text('{"preset": "quick"}')
-    assert "holds a run of `identify` itself" in refused("all", "--out", "mine")
+    assert "holds a run of `identify`, and the page would show both" in refused("all", "--out", "mine")
     assert called == []
 
 

@@ -157,7 +157,7 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     assert open_ones == {"elbow_damping"} == {*excitation["identifiable_by_it"]} and excitation["left_open"] == []
     assert excitation["addition"]
     said = " ".join(capsys.readouterr().out.split())
-    assert "What these recordings tell of the parameters" in said and "record besides" in said
+    assert "Identifiability of the parameters" in said and "record besides" in said
     assert excitation["sentence"] in (out / "check.html").read_text()
     table = np.genfromtxt(out / "addition.csv", delimiter=",", names=True)
     assert table.dtype.names == ("time", *JOINTS)

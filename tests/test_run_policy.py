@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
+from droid_jax.commands.evaluate import Evaluate, _film, _print_trials, _robot, _task
 from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, synthetic_robot_of
 from droid_jax.commands.train import Train, _fit_folder
@@ -319,7 +319,7 @@ def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, rob
     task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
     training = {"setup": {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": fit}, "task": task}
     training |= {"synthetic_robot": robot, "scene": "door", "effects": [], "versions": {}, "device": "", "history": []}
-    _tell(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
+    _print_trials(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
     said = capsys.readouterr().out
     assert "synthetic robot: 100 % success" in said
     assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == another

@@ -55,7 +55,7 @@ def test_a_second_run_is_refused_at_once(refused: Callable[..., str], holder, tm
     process = holder(tmp_path / "run")
     said = refused(command, "--out", tmp_path / "run")
     assert said == (
-        f"error: another run writes to {tmp_path / 'run'} (process {process.pid}): wait for its end, or choose "
+        f"error: another run writes to {tmp_path / 'run'} (process {process.pid}): wait until it ends, or choose "
         "another --out"
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.signals import LogMotion, servo_torque
-from droid_jax.preflight.torques import EXPLAINED, MODEL_FACTOR, unexplained_share
+from droid_jax.preflight.torques import EXPLAINED, MODEL_FACTOR, residual_share
 from droid_jax.recordings.recording import Channel, Recording
 
 DELAYS = np.arange(0.0, 0.205, 0.005)  # s, delays of the command that are tested
@@ -29,7 +29,7 @@ def check_delay(scene: Scene, recording: Recording, motion: LogMotion) -> list[F
     best = []
     for joint in joints:
         unexplained = [
-            unexplained_share(
+            residual_share(
                 motion.torque[joint], [(servo_torque(scene, motion, joint, late), 1 / MODEL_FACTOR, MODEL_FACTOR)]
             )
             for late in DELAYS

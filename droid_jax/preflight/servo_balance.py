@@ -21,10 +21,10 @@ from droid_jax.preflight.torques import (
     DELAYS,
     EXPLAINED,
     UNEXPLAINED,
+    body_residual_share,
     explains,
     factor,
     friction_terms,
-    unexplained_by_body,
 )
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 
@@ -75,7 +75,7 @@ def _balance(scene: Scene, recording: Recording, motion: LogMotion) -> _Balance:
     torques: dict[str, np.ndarray] = {}
     for joint, body in bodies.items():
         every = [servo_torque(scene, motion, joint, late)[rows] for late in DELAYS]
-        shares = [unexplained_by_body(torque, body, gravity=gravity, motor=True) for torque in every]
+        shares = [body_residual_share(torque, body, gravity=gravity, motor=True) for torque in every]
         best = int(np.argmin(shares))
         residuals[joint], torques[joint] = shares[best], every[best]
     return residuals, torques, bodies
@@ -102,7 +102,7 @@ def _gains(
         expected = body.weight * gravity + body.inertial
         size = factor(torque, expected, *friction_terms(body))
         if size > 0 and size * np.std(expected) > LEAST_BODY_SHARE * np.std(torque):
-            unexplained = unexplained_by_body(torque / size, body, gravity=gravity, motor=True)
+            unexplained = body_residual_share(torque / size, body, gravity=gravity, motor=True)
             if unexplained < EXPLAINED:
                 visible[joint] = size, unexplained
     size = float(np.median([size for size, _ in visible.values()])) if visible else 1.0

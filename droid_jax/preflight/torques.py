@@ -71,7 +71,7 @@ def check_torque(scene: Scene, recording: Recording, motion: LogMotion) -> list[
 # Unexplained shares ---------------------------------------------------------------------------
 
 
-def unexplained_share(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, float, float]]) -> float:
+def residual_share(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, float, float]]) -> float:
     """Unexplained share of a torque's mean square after a bounded least-squares fit of terms and a constant.
 
     Args:
@@ -102,7 +102,7 @@ def unexplained_share(torque: np.ndarray, terms: Iterable[tuple[np.ndarray, floa
     return min(1.0, unexplained / len(scaled))
 
 
-def unexplained_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool, motor: bool) -> float:
+def body_residual_share(torque: np.ndarray, expected: Expected, *, gravity: bool, motor: bool) -> float:
     """Unexplained share of a joint's torque [K] after a fit of rigid body and friction.
 
     gravity: whether the torque contains the weight.  motor: whether it is the motor's, which moves the rotor too.
@@ -113,7 +113,7 @@ def unexplained_by_body(torque: np.ndarray, expected: Expected, *, gravity: bool
     if motor:
         own = float(np.sqrt(np.mean(expected.inertial**2) / (np.mean(expected.acceleration**2) + 1e-12)))
         terms.append((expected.acceleration, 0.0, ROTOR_FACTOR * own))
-    return unexplained_share(torque, terms)
+    return residual_share(torque, terms)
 
 
 def friction_terms(expected: Expected) -> list[np.ndarray]:
@@ -142,7 +142,7 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     torques = {joint: motion.torque[joint][motion.inner] for joint in bodies}
 
     def residuals(bodies: Mapping[str, Expected], torques: Mapping[str, np.ndarray], gravity: bool) -> dict[str, float]:
-        return {j: unexplained_by_body(torques[j], bodies[j], gravity=gravity, motor=motor) for j in torques}
+        return {j: body_residual_share(torques[j], bodies[j], gravity=gravity, motor=motor) for j in torques}
 
     stated, weightless = residuals(bodies, torques, gravity), residuals(bodies, torques, not gravity)
     if found := _of_gravity(recording, stated, weightless, "the rigid body's torques"):
@@ -164,7 +164,7 @@ def _of_bodies(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     for joint in bodies:
         tried("sign", joint, f"the position of {joint} has the wrong sign", motion.turned(joint), motion)
     each = {
-        j: {k: unexplained_by_body(torques[k], bodies[j], gravity=gravity, motor=motor) for k in torques}
+        j: {k: body_residual_share(torques[k], bodies[j], gravity=gravity, motor=motor) for k in torques}
         for j in bodies
     }
     order = fitting_order(each)
@@ -262,7 +262,7 @@ def _alone(
     def better(unexplained: float) -> bool:
         return _better(unexplained, stated) and unexplained < share * stated
 
-    unexplained = partial(unexplained_by_body, expected=body, gravity=gravity, motor=motor)
+    unexplained = partial(body_residual_share, expected=body, gravity=gravity, motor=motor)
     expected = body.weight * gravity + body.inertial
     size = factor(torque, expected, *friction_terms(body))
     by = "weight, inertia and friction"
@@ -337,7 +337,7 @@ def _of_servos(scene: Scene, recording: Recording, motion: LogMotion, bodies: Ma
     right = [
         joint
         for joint, body in bodies.items()
-        if unexplained_by_body(motion.torque[joint][motion.inner], body, gravity=gravity, motor=motor) < EXPLAINED
+        if body_residual_share(motion.torque[joint][motion.inner], body, gravity=gravity, motor=motor) < EXPLAINED
         and gravity and np.mean(body.weight**2) > 0.25 * np.mean(motion.torque[joint] ** 2)
     ]  # fmt: skip
     return _compared(recording, torques, servos, by, right)
@@ -366,7 +366,7 @@ def _of_replay(scene: Scene, recording: Recording, motion: LogMotion) -> list[Fi
 
 def _least(torque: np.ndarray, expected: Sequence[np.ndarray]) -> float:
     """Smallest unexplained share of a torque [K] over several predictions [K]."""
-    return min(unexplained_share(torque, [(x, 1 / MODEL_FACTOR, MODEL_FACTOR)]) for x in expected)
+    return min(residual_share(torque, [(x, 1 / MODEL_FACTOR, MODEL_FACTOR)]) for x in expected)
 
 
 def _likest(torque: np.ndarray, expected: Sequence[np.ndarray]) -> np.ndarray:
