@@ -310,8 +310,8 @@ def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:
     for path, recording in zip(paths, recordings, strict=True):
         if recording.name in files:
             raise ValueError(
-                f"{files[recording.name]} and {path} are both named {recording.name!r}, but results refer to recordings "
-                f"by name: `python -m droid_jax.run convert {path} --name OTHER --out other.npz` changes it"
+                f"{files[recording.name]} and {path} are both named {recording.name!r}, but results refer to "
+                f"recordings by name: `python -m droid_jax.run convert {path} --name OTHER --out other.npz` changes it"
             )
         files[recording.name] = path
     count = len(command.recording)
