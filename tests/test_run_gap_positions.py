@@ -1,4 +1,4 @@
-"""The command `gap` on positions alone: of repeats, and of one commanded log by stretches of time."""
+"""The command `gap` on positions alone: of repeats, and of one commanded log in windows of time."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ def test_positions_of_repeats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_positions_of_one_commanded_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Beside it: whole replays, and another log that judges."""
+    """Beside it: whole replays, and a test recording."""
     monkeypatch.setattr(made, "SECONDS", 18.0)
     logs = [swung("log", 1.0, 0.31, noise=NOISE, friction=FRICTION)]
     judge = swung("judge", 0.8, 0.43, noise=NOISE, friction=FRICTION)
     save_recording(judge, tmp_path / "judge.npz")
     answer = found(tmp_path, logs, "--test-recording", str(tmp_path / "judge.npz"))
-    assert answer.split.by == "windows" and "stretches of time" in answer.split.limits
+    assert answer.split.by == "windows" and "windows of time" in answer.split.limits
     assert [d.recording for d in answer.discrepancies.values()] == [
         "log, every other block", "log, the blocks between", "judge",
     ]  # fmt: skip

@@ -345,7 +345,7 @@ def test_what_a_table_lacks_is_said_in_a_sentence(tmp_path: Path):
     assert "counts_per_turn is needed" in refused(path, whole(position=ChannelMap("q{n}", unit="counts")))
     assert "torque_constant is needed for the unit 'A'" in refused(path, whole(torque=ChannelMap("tau{n}", unit="A")))
     assert "no column of time is named" in refused(path, whole(time=None))
-    assert "does not say which of its columns are what" in refused(path)
+    assert "does not say what its columns are" in refused(path)
     hurt = log(tmp_path / "b.csv", t=np.where(np.arange(len(TIME)) == 5, np.nan, TIME))
     assert "time, row 5: expected a number, got nan" in refused(hurt, whole())
     hurt = log(tmp_path / "c.csv", cmd9=np.where(np.arange(len(TIME)) == 3, np.nan, TIME))

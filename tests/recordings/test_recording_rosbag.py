@@ -431,7 +431,7 @@ def test_topic_errors(tmp_path: Path) -> None:
     path = pulled(tmp_path, "ros1")
     fails([path], "run.bag", "no topic '/joints'", "the bag has: /command, /joint_states", state_topic="/joints")
     fails([path], "no topic '/cmd'", "/command, /joint_states", command_topic="/cmd")
-    fails([path], "topics of their own", command_topic="/joint_states")
+    fails([path], "must come from two topics", command_topic="/joint_states")
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(tmp_path / "silent", version=9) as writer:
         writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
@@ -456,7 +456,8 @@ def test_joints_that_messages_call_otherwise(tmp_path: Path, capsys: pytest.Capt
         for topic, prefix in {"/joint_states": "fr3_", "/goal": "fr3_", "/plain": "", "/plain_goal": ""}.items():
             bag.state(t, topic=topic, names=tuple(f"{prefix}{joint}" for joint in JOINTS))
     path = bag.write()
-    fails([path], "if 'j1' is called 'fr3_j1' there, say so for each: --joints NAME=fr3_j1, where NAME is that in")
+    advice = "give both names of each joint: --joints NAME=fr3_j1, where NAME is its name in"
+    fails([path], f"if 'j1' is called 'fr3_j1' there, {advice}")
     fails([path], "no joint j2; ", "--joints NAME=fr3_j2", joints=("fr3_j1", "j2"))
     found = read_bags([path], joints=["j1", "j2"], torque=TORQUE, state_topic="/plain", command_topic="/plain_goal")
     said = ["--torque", "link", "--gravity", "--command-topic", "/goal", "--out", tmp_path / "door.npz"]
