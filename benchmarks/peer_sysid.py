@@ -1,4 +1,4 @@
-"""mujoco.sysid beside this program: same recordings, same parameters, same start, same machine.
+"""Compares mujoco.sysid with this program: same recordings, parameters, start and machine.
 
     pip install -c constraints.txt -e ".[peers]"
     python benchmarks/peer_sysid.py [--quick] [--out DIR]

@@ -1,4 +1,4 @@
-"""How long a fit takes on this machine, compilation included: the paper's size, and the command's quick preset.
+"""Time of a fit on this machine with compilation: of the paper's size, and of the command's quick preset.
 
     python benchmarks/time_to_fit.py [--quick] [--out DIR]
 

@@ -1,13 +1,13 @@
-"""The blind suite: does the search for a missing effect find what was hidden, and nothing where nothing was?
+"""The blind suite: does the search find the hidden effect, and nothing where nothing is hidden?
 
     python experiments/hidden_effects.py limits --scenes hinge bench   # once, before the method is frozen
     python experiments/hidden_effects.py make --scenes hinge bench     # recordings and, elsewhere, the truth
-    python experiments/hidden_effects.py search                        # sees recordings only; goes on after a stop
-    python experiments/hidden_effects.py oracle                        # what the right names could reach
-    python experiments/hidden_effects.py score                         # opens the seals
-    python experiments/hidden_effects.py all --quick                   # make, search and score a few cases
+    python experiments/hidden_effects.py search # sees recordings only; can be stopped and continued python
+    experiments/hidden_effects.py oracle # the best result that the right names allow python
+    experiments/hidden_effects.py score # opens the seals python experiments/hidden_effects.py all --quick # make,
+    search and score a few cases
 
-The package `blind` says how it is kept honest.  Each command ends with one line of JSON.
+The package `blind` describes how the search is kept blind.  Each command ends with one line of JSON.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ QUICK_EFFECTS = ("hinge_preload",)
 
 @dataclass(frozen=True)
 class Limits:
-    """Detection limits of every hidden effect, by scene; what the file holds of other scenes stays."""
+    """Compute detection limits of every hidden effect, by scene; entries of other scenes stay in the file."""
 
     scenes: tuple[SceneName, ...] = ("hinge", "bench")
     """Scenes."""
@@ -68,7 +68,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Make:
-    """Record cases: what the search may see goes to OUT/cases, the truth to OUT/sealed."""
+    """Record cases: recordings for the search go to OUT/cases, the truth to OUT/sealed."""
 
     scenes: tuple[SceneName, ...] = ("hinge", "bench")
     """Scenes."""
@@ -108,7 +108,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Fit the library's forms of what was hidden from the truth: what a search could reach at best."""
+    """Fit the library's form of the hidden effect, starting from the truth: the best possible result of a search."""
 
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names of cases; default: all in OUT/cases."""

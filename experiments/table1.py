@@ -4,9 +4,9 @@
 
 Reads the cases door_0, door_1 and door_2 of `identify_suite.py` in DIR/identify_cases (that script makes them);
 writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the synthetic robot (its
-recordings are not public), all but the joints' damping, which here is the servo's (docs/paper.md).  So the
-program's best fit is to be near the paper's mean; widths are each one's own: the paper's deviation, and here the ends
-of the 90 % interval, which of a value that is fitted in its logarithm do not lie alike on both sides.
+recordings are not public), except the joints' damping, which here is the servo's (docs/paper.md).  The program's best
+fit should therefore be near the paper's mean.  Widths cannot be compared directly: the paper gives a deviation, this
+program the ends of the 90 % interval, which is asymmetric for a value that is fitted in its logarithm.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Arguments:
 
 def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     """Parameter -> the paper's (mean, deviation) and, by door, truth, best fit, 90 % interval, whether that holds the
-    truth and whether the motion tells the parameter.
+    truth, and whether the parameter is identifiable.
 
     cases: by number of springs, "parameters" of the suite's cases.
     """
