@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     BEGUN.clear()
     given = _given(list(sys.argv[1:] if arguments is None else arguments))
     command: Any = None
-    with console.last_words(lambda: _going_on(command)):
+    with console.stop_advice(lambda: _going_on(command)):
         try:
             if given == ["--version"]:
                 print(f"droid_jax {importlib.metadata.version('droid_jax')}")
@@ -174,9 +174,9 @@ def _ended(error: BaseException, command: Any) -> int | None:
     """Print the error that ended a command and return the exit code; None for a bug of the program."""
     who = distributed.speaker()
     if isinstance(error, KeyboardInterrupt):  # only if another program calls main; otherwise `console` handles it
-        print(console.words(signal.SIGINT), file=sys.stderr)
+        print(console.stop_message(signal.SIGINT), file=sys.stderr)
         return 128 + signal.SIGINT
-    if isinstance(error, BrokenPipeError) and console.nobody_reads():
+    if isinstance(error, BrokenPipeError) and console.reader_gone():
         console.drop_output()
         if command is None:  # --help | head is no error
             return 0

@@ -51,7 +51,7 @@ def test_an_error_with_a_closed_output(tmp_path: Path):
 
 @pytest.mark.parametrize("arguments", ["--version", "--help", f"convert {LOG} --out log.npz"])
 def test_a_pipe_that_nobody_reads(tmp_path: Path, arguments: str):
-    """All is done where only the last words are not heard."""
+    """The run is done although the reader of its last line is gone."""
     done = shell(f"set -o pipefail; droid-jax {arguments} | true", cwd=tmp_path)
     assert done.stderr == "" and done.returncode in (0, 141)
 

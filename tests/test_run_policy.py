@@ -55,7 +55,7 @@ def test_a_fit_that_is_not_whole_is_refused(scene, tmp_path: Path):
     """Started over and stopped: what lies there is of the run before."""
     folder = fit(tmp_path, scene, springs=2, seed=7, recording=[])
     (folder / "config.json").unlink()
-    with pytest.raises(ValueError, match="holds a run that is not whole"):
+    with pytest.raises(ValueError, match="holds a run that is not complete"):
         source(folder, knob=0)
 
 

@@ -192,7 +192,9 @@ def test_a_model_that_does_worse_on_the_test_recording_is_doubted(made: Callable
     of = gap_json("named", ROLES)["discrepancies"]
     of["test"] |= {"after": 1.5 * of["test"]["before"], "closed": -0.5}
     gap, written = made("named", discrepancies=of)
-    assert "test_worse" in gap_doubts(gap) and "does worse than without" in spaced(written.doubts["test_worse"])
+    assert "test_worse" in gap_doubts(gap) and "larger with the effects than without" in spaced(
+        written.doubts["test_worse"]
+    )
     assert "50 % more" in spaced(written.text)
     assert "test_worse" not in gap_doubts(made("named")[0])
 
@@ -235,7 +237,12 @@ def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
         ("fit not converged", {}, "fit not converged", "identify --preset standard --restarts 3"),
         ("fit not converged", {"split": BLOCKS}, "fit not converged", "Next: give the parameters tighter priors"),
         ("none", {"split": BLOCKS}, "none", "a smaller effect would need repeats, a longer log"),
-        ("unexplained", {"split": BLOCKS}, "none passed", "where the most is left, noise included: joint 1"),
+        (
+            "unexplained",
+            {"split": BLOCKS},
+            "none passed",
+            "where the remaining discrepancy is largest, noise included: joint 1",
+        ),
     ],
 )
 def test_what_to_do_next(made: Callable, verdict: str, changes: dict, step: str, said: str) -> None:

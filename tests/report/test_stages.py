@@ -56,7 +56,7 @@ def test_a_search_in_another_scene_is_left_over(tmp_path: Path):
 def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     folder = run(tmp_path, stage, last=False, files={GAUSSIAN: "of an earlier run"})
     assert unfinished(folder)
-    with pytest.raises(ValueError, match="holds a run that is not whole: run its command again"):
+    with pytest.raises(ValueError, match="holds a run that is not complete: run its command again"):
         needs_whole(folder)
     with pytest.raises(ValueError, match="run its command again"):  # and not one to run another command
         write_report(folder)
