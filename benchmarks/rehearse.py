@@ -5,8 +5,8 @@
 The lone hinge, an arm of two links beside a driven door, and the built-in door.  Each effect that has a place in the
 scene, and for which the synthetic robot has a separate law, is hidden at the size that the quick form predicts.  While
 it is found, smaller sizes follow, otherwise larger ones, in steps from 0.5 to 2 times that size.  Results of earlier
-runs at other sizes are used too.  Every log is fitted and searched (`droid_jax.rehearsal.full`).  Each case has a folder
-under RUNS, so that a stopped run can be continued.
+runs at other sizes are used too.  Every log is fitted and searched (`droid_jax.rehearsal.full`).  Each case has a
+folder under RUNS, so that a stopped run can be continued.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_line", "tuned")
 
 
 def command(place: Path, recordings: Sequence[Recording], *options: str) -> list[str]:
-    """A whole command line about the elbow."""
+    """A command line for the elbow."""
     for k, recording in enumerate(recordings):
         save_recording(recording, place / f"{k}.npz")
     files = [str(place / f"{k}.npz") for k in range(len(recordings))]
@@ -69,7 +69,7 @@ def test_halves_are_the_first_and_the_last_repeats():
 
 
 def blind(count: int) -> Recording:
-    """Commanded, its positions not measured: no window could begin."""
+    """A commanded log without measured positions, in which no window can begin."""
     recording = with_repeats(count)
     return replace(recording, channels={"torque": recording.channel("torque")})
 
@@ -98,7 +98,7 @@ def test_too_few_repeats_say_what_can_still_be_done(recordings: list[Recording],
 
 
 def test_commanded_logs_with_few_repeats_are_cut_into_windows():
-    """Any number of them, of any number of repeats that is too small to be flipped; others may be test data."""
+    """Any number of logs with too few repeats for sign flips; further ones may be test data."""
     one, three = with_repeats(1), with_repeats(3)
     for recordings in ([one], [three], [with_repeats(15)], [one] * 5, [with_repeats(8), three], [with_repeats(8)] * 4):
         assert split_of(recordings) is Split.WINDOWS

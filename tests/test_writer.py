@@ -225,7 +225,7 @@ def test_a_page_of_somebody_else_stays(tmp_path: Path):
 
 
 def test_what_was_exported_and_then_changed_stays(tmp_path: Path):
-    """The loop on a robot's computer is made to be changed."""
+    """The control loop for a robot's computer is meant to be changed by the user."""
     write_own(tmp_path / "out", {"control.py": b"one", "policy.npz": b"1"})
     write_own(tmp_path / "out", {"control.py": b"two", "policy.npz": b"2"})
     (tmp_path / "out" / "control.py").write_bytes(b"mine")

@@ -1,4 +1,4 @@
-"""The recording type: what validation refuses and how it says so, the hash, subsets, windows."""
+"""The recording type: refusals of validation and their messages, the hash, subsets, windows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What belongs together in a folder of `all`, and which runs are whole."""
+"""Which results in a folder of `all` belong together, and which runs are complete."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     ],
 )
 def test_a_damaged_setup_is_said(tmp_path: Path, text: str, said: str):
-    """What was made together cannot be told from it: silence could pass an earlier run's results off as this one's."""
+    """It does not show which results belong together; those of an earlier run could be mistaken for this run's."""
     (tmp_path / "setup.json").write_text(text)
     for ask in (setup, extended_of, unfinished, needs_whole):
         with pytest.raises(ValueError, match=r"setup\.json.*start the run of this folder over with --again") as caught:
