@@ -223,7 +223,7 @@ def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
 
 
 def test_a_beginning_that_stands_still_is_looked_at_for_longer():
-    """Regression: of a log that begins at rest, only motion up to half of the range was used, and taken for all of it."""
+    """Regression: of a log that begins at rest, only motion up to half of its range was used."""
     time = np.arange(0.0, 60.0, 0.01)
     went = 0.3 * np.sin(np.maximum(time - 19.0, 0.0))[:, None] * np.ones(2)
     log = recording(time=time, command=went, channels=recording().channels)
