@@ -59,7 +59,7 @@ class Unpack:
     """Write the files of an archive."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Of the archive."""
+    """Name of the archive."""
     out: Path | None = None
     """Folder; default: runs/NAME."""
     place: Path = PLACE
@@ -71,9 +71,9 @@ class Pack:
     """Make an archive of a folder's files, without locks."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Of the archive."""
+    """Name of the archive."""
     folder: Path
-    """Whose files are packed."""
+    """Folder whose files are packed."""
     place: Path = PLACE
     """Folder of the archives."""
 

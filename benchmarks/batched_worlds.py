@@ -182,7 +182,7 @@ class BatchedWorlds:
     mjlab: Path | None = None
     """Python that has mjlab."""
     worlds: int = 8
-    """Worlds, each with a draw of its own."""
+    """Worlds, each with another draw."""
     seconds: float = 1.0
     """Simulated time."""
     out: Path = Path(__file__).resolve().parent / "results"

@@ -57,7 +57,7 @@ class Arguments:
     population: int = 128
     """Samples of a generation."""
     generations: int = 30
-    """Of the search."""
+    """Generations of the search."""
 
 
 def start(

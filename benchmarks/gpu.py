@@ -68,23 +68,23 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """Small sizes on whatever there is: shows that it runs, its numbers mean nothing."""
+    """Small sizes on any device: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of gpu.json."""
     only: tuple[str, ...] = tuple(SHARES)
-    """Parts; what an earlier run of the same code and samples measured of the others stays."""
+    """Parts to run; results of the others from an earlier run of the same code and samples are kept."""
     seconds: float | None = None
-    """For all parts together; default: 480, with --quick 220."""
+    """Seconds for all parts together; default: 480, with --quick 220."""
     seed: int = 0
-    """Of the samples, the search, the robot and the policy."""
+    """Seed of the samples, the search, the robot and the policy."""
     commit: str = CODE.get("git", "")
-    """Of the code, where no git can say it."""
+    """Commit of the code, where git is missing."""
     part: str = ""
-    """Run this part in this process, and write to --kept: how the script calls itself."""
+    """Run this part in this process, and write to --kept; used by the script itself."""
     kept: Path = Path()
     """File of a part's results."""
     until: float = 0.0
-    """When it is stopped, s since 1970."""
+    """End of the part's time, s since 1970."""
 
     def __post_init__(self) -> None:
         if unknown := [part for part in (*self.only, self.part) if part and part not in SHARES]:

@@ -74,11 +74,11 @@ class Arguments:
     quick: bool = False
     """Two runs of each command instead of 20."""
     out: Path = Path("runs/robustness")
-    """Where kills.json is written; what was done lies in its folder kills."""
+    """Folder of kills.json; finished runs are in its subfolder kills."""
     only: tuple[str, ...] = COMMANDS
     """Commands."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the moments."""
 
 
 def main(arguments: Arguments) -> None:

@@ -111,23 +111,23 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """One case of each kind on the hinge; its numbers are not for keeping."""
+    """One case of each kind on the hinge; its numbers are not to be reported."""
     null: int = 50
-    """Cases with nothing hidden of each scene and set of channels."""
+    """Cases without a hidden effect, for each scene and set of channels."""
     blind: int = 60
-    """Cases with something hidden, over all of them."""
+    """Cases with a hidden effect, over all scenes and sets of channels."""
     hidden: Literal["library", "setup"] = "library"
     """What is hidden: effects of the library in general, or errors of the set-up, whose result is setup_errors.json."""
     only: str = ""
-    """Cases whose name begins so; the others are left for another process."""
+    """Run only cases whose name begins with this text."""
     windows: float = 0.0
-    """s, of windows that are replayed each from its own measured state; 0: motions are replayed whole."""
+    """Length of the windows, s, each replayed from its measured state; 0: whole motions are replayed."""
     minutes: float = 0.0
-    """No case is begun after so many; 0: all are made."""
+    """No case is begun after this time; 0: all are run."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     runs: Path | None = None
     """Folder of the cases; default: runs/lone_logs, of --quick below OUT."""
     out: Path = ROOT / "benchmarks" / "results"

@@ -42,11 +42,11 @@ class Mujoco4:
     tests: bool = True
     """Run the tests there."""
     minutes: float = 60.0
-    """After which no further group of test files is begun; those that were not run are named."""
+    """No group of test files is begun after this time; groups that were not run are listed."""
     processes: int = 1
-    """Of pytest."""
+    """Processes of pytest."""
     seed: int = 0
-    """Of the disturbed values."""
+    """Seed of the disturbed values."""
     out: Path = HERE / "results"
     """Folder for mujoco4.json."""
     quick: bool = False

@@ -38,15 +38,15 @@ class NeutralResult:
     fit: dict[str, Path] = field(default_factory=dict)
     """Folders of finished fits by name of the case."""
     recording: dict[str, Path] = field(default_factory=dict)
-    """A recording by name of the case that its fit did not see."""
+    """For each case by name, a recording that its fit did not see."""
     scene: dict[str, Path] = field(default_factory=dict)
-    """MJCF by name of the case, where it is not where the fit found it."""
+    """MJCF by name of the case, if it has moved since the fit."""
     xl330: Path | None = None
     """Folder of the logs of Rhoban/bam, for the case xl330, whose fit is experiments/results/real_xl330.json."""
     fine: int = 8
     """Steps of C in one of the replay's."""
     seed: int = 0
-    """Of the draws."""
+    """Seed of the draws."""
     out: Path = HERE / "results"
     """Folder for neutral_result.json."""
     quick: bool = False

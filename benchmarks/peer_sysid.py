@@ -38,11 +38,11 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """Few iterations and short logs: shows that it runs, says nothing about quality."""
+    """Few iterations and short logs: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of peer_sysid.json and of the cases."""
     cases: tuple[str, ...] = ()
-    """Only these; all unless given."""
+    """Only these cases; default: all."""
 
 
 def cases(quick: bool) -> dict[str, Case]:

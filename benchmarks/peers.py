@@ -65,9 +65,9 @@ class Arguments:
     data: Path | None = None
     """Folder with bam_xl330, go2_leg and so101; without it the real logs are left out."""
     problems: tuple[str, ...] = ()
-    """Only these; all that there are data for unless given."""
+    """Only these problems; default: all with data."""
     quick: bool = False
-    """The spring, and two seconds of the leg where there are data; numbers that are not for keeping."""
+    """The spring, and two seconds of the leg if its data exist; its numbers are not to be reported."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of peers.json, and of the runs."""
 

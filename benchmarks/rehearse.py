@@ -63,19 +63,19 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """One effect of the hinge at one size; its numbers are not for keeping."""
+    """One effect of the hinge at one size; its numbers are not to be reported."""
     scenes: tuple[str, ...] = SCENES
-    """To make cases in; the others are summed up, if any are there."""
+    """Scenes in which cases are run; existing cases of the others are summarised."""
     seeds: int = SEEDS
-    """Cases of each effect at each size that is tried; it counts as found there if it is in all of them."""
+    """Cases of each effect at each tried size; the effect counts as found if it is found in all of them."""
     minutes: float = 0.0
-    """No case is begun after so many; 0: all are made."""
+    """No case is begun after this time; 0: all are run."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     earlier: tuple[Path, ...] = ()
-    """Folders of cases of earlier runs of the same search, whose sizes count."""
+    """Folders of cases of earlier runs of the same search, which are used too."""
     runs: Path | None = None
     """Folder of the cases; default: runs/rehearse, of --quick below OUT."""
     out: Path = ROOT / "benchmarks" / "results"

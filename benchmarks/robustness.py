@@ -73,7 +73,7 @@ class Arguments:
     arguments: int = 4_000
     """Calls with wrong arguments."""
     seed: int = 0
-    """Of all mutations."""
+    """Seed of all mutations."""
     only: tuple[str, ...] = ()
     """Kinds whose name holds one of these words."""
     workers: int = WORKERS

@@ -67,7 +67,7 @@ class Arguments:
     repeats: int = 3
     """Timed calls of a point."""
     point: str = ""
-    """JSON of one point, measured in this process: how the script calls itself."""
+    """JSON of one point, measured in this process; used by the script itself."""
 
     def __post_init__(self) -> None:
         if unknown := [axis for axis in self.only if axis not in AXES]:

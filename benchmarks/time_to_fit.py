@@ -38,7 +38,7 @@ class Arguments:
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of time_to_fit.json."""
     part: str = "all"
-    """all, or fit: started by it in a process of its own."""
+    """all; fit is used by the script itself, in a separate process."""
 
 
 def fit(generations: int, most: float | None = None) -> dict[str, Any]:

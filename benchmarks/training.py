@@ -60,13 +60,13 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """A few actions: shows that it runs, says nothing about quality."""
+    """A few actions: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of training.json."""
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """Of training."""
+    """Preset of the training."""
     seed: int = 0
-    """Of the policy."""
+    """Seed of the policy."""
     trials: int = 100
     """Episodes in simulation, and trials on the synthetic robot."""
 

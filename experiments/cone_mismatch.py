@@ -45,9 +45,9 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """The torques' difference alone."""
+    """Only compare torques."""
     cases: int = 4
-    """Robots that are searched."""
+    """Number of robots to search."""
     commit: str = "HEAD"
     """Commit that froze the method: seeds derive from it."""
     out: Path = ROOT / "runs" / "cone_mismatch"

@@ -47,7 +47,7 @@ class Arguments:
     """Options of the experiment."""
 
     policies: Path = REPORTED
-    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
+    """Folder of the policies of table2.py; default: the reported ones in benchmarks/results/archive."""
     quick: bool = False
     """One setting, one motion, one short trial of one policy of each method: shows that it runs."""
     out: Path = RESULTS

@@ -63,7 +63,7 @@ class Arguments(Options):
     springs: int = 0
     """The synthetic robot's column of Table I."""
     policy: Path | None = None
-    """A policy.npz of any run, instead of one that is trained."""
+    """A policy.npz of any run, instead of training one."""
     hide: tuple[str, ...] = ()
     """name=amplitude or name[joint]=amplitude; default: every effect that a policy can be tried with."""
     first: int = PILOT

@@ -64,11 +64,11 @@ class Arguments:
     quick: bool = False
     """Two seeds."""
     seeds: int = 100
-    """How many."""
+    """Number of seeds."""
     first: int = 0
-    """The first of them."""
+    """The first seed."""
     sum_only: bool = False
-    """Sum up the seeds that are there."""
+    """Run nothing; summarise the existing seeds."""
     out: Path = ROOT / "runs" / "friction_at_rest"
     """Folder of the seeds and of friction_at_rest.json."""
 

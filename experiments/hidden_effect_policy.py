@@ -70,7 +70,7 @@ class Arguments(Options):
     """Options of the experiment."""
 
     hide: tuple[str, ...] = ("magnetic_catch=12",)
-    """What the synthetic robot hides, name=amplitude."""
+    """Effect that the synthetic robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
 

@@ -2,10 +2,10 @@
 
     python experiments/hidden_effects.py limits --scenes hinge bench   # once, before the method is frozen
     python experiments/hidden_effects.py make --scenes hinge bench     # recordings and, elsewhere, the truth
-    python experiments/hidden_effects.py search # sees recordings only; can be stopped and continued python
-    experiments/hidden_effects.py oracle # the best result that the right names allow python
-    experiments/hidden_effects.py score # opens the seals python experiments/hidden_effects.py all --quick # make,
-    search and score a few cases
+    python experiments/hidden_effects.py search                        # sees recordings only; can be continued
+    python experiments/hidden_effects.py oracle                        # the best result that the right names allow
+    python experiments/hidden_effects.py score                         # opens the seals
+    python experiments/hidden_effects.py all --quick                   # make, search and score a few cases
 
 The package `blind` describes how the search is kept blind.  Each command ends with one line of JSON.
 """
@@ -59,11 +59,11 @@ class Limits:
     draws: int = 3
     """Robots drawn; the median of their limits counts."""
     out: Path = LIMITS
-    """The file."""
+    """File for the limits."""
     kept: Path = RUNS / "limits"
-    """Folder of what is known so far of each robot: a run that was stopped goes on."""
+    """Folder of the results so far, from which a stopped run is continued."""
     quick: bool = False
-    """One robot, one effect; into a file of its own."""
+    """One robot, one effect; writes another file."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class Make:
     out: Path = RUNS
     """Folder of cases and seals."""
     unsearched: bool = False
-    """Only cases without a file in OUT/results: a run that goes on elsewhere needs no others."""
+    """Only cases without a file in OUT/results, to continue a run elsewhere."""
     quick: bool = False
-    """The lone hinge: nothing, and a preload.  Without --out in a folder beside the full run's, *_quick."""
+    """The lone hinge, without a hidden effect and with a preload.  The default folder ends with _quick."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ class Search:
     scenes: tuple[SceneName, ...] = ()
     """Only cases of these scenes."""
     at_most: int = 1000000
-    """Stop after so many."""
+    """Stop after this number of cases."""
     results: Path | None = None
-    """Folder of what is found, a file a case; default: `results` beside the folder that holds the case's folder."""
+    """Folder of the results, one file per case; default: `results` beside the folder of the cases."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Oracle:
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names of cases; default: all in OUT/cases."""
     out: Path = RUNS
-    """Folder of cases and seals; what is found goes to `oracle` beside them."""
+    """Folder of cases and seals; results go to its subfolder `oracle`."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Score:
     out: Path = RUNS
     """Folder of cases and seals."""
     limits: Path = LIMITS
-    """Detection limits, for what a hidden amplitude is in the library's terms."""
+    """Detection limits, which convert a hidden amplitude to that of the library's effect."""
     results: Path | None = None
     """Folder of hidden_effects.json and of its table, hidden_effects.md; default: OUT."""
 

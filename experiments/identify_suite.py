@@ -53,7 +53,7 @@ class Arguments:
     """Options of the suite."""
 
     quick: bool = False
-    """One case of each part (of the poses both) with a small budget: shows that it runs, says nothing about quality."""
+    """One case of each part (both poses) with a small budget: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of identify.json and of the cases."""
     parts: tuple[Part, ...] = ("doors", "calibration", "pose", "parity")
@@ -81,16 +81,16 @@ def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
 
     search: mean and deviation in the coordinate in which the parameter was fitted, where it is normal.
     """
-    told = found.full_gaussian
-    low, high = told.interval(LEVEL)
-    assert told.coordinates == "search"
-    deviation = np.sqrt(np.diag(told.cov))
+    gaussian = found.full_gaussian
+    low, high = gaussian.interval(LEVEL)
+    assert gaussian.coordinates == "search"
+    deviation = np.sqrt(np.diag(gaussian.cov))
     parameters = {
         p.name: {
             "truth": truth[p.name],
             "best": float(found.best[i]),
             "interval": [float(low[i]), float(high[i])],
-            "search": [float(told.mean[i]), float(deviation[i])],
+            "search": [float(gaussian.mean[i]), float(deviation[i])],
             "inside": bool(low[i] <= truth[p.name] <= high[i]),
             "identifiable": found.identifiability[i].identifiable,
             "shrinkage": found.identifiability[i].shrinkage,

@@ -185,7 +185,7 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
 def table(result: Estimate) -> list[dict[str, Any]]:
     """One entry per parameter: value, interval, and whether this recording identifies it."""
     low, high = result.gaussian.interval(LEVEL)
-    told = identifiability(result.gaussian, np.ones(len(result.space)))
+    verdicts = identifiability(result.gaussian, np.ones(len(result.space)))
     return [
         {
             "name": p.name,
@@ -196,8 +196,8 @@ def table(result: Estimate) -> list[dict[str, Any]]:
             "value": float(result.best[i]),
             "interval": [float(low[i]), float(high[i])],
             "excludes_zero": bool(low[i] > 0 or high[i] < 0),
-            "identifiable": told[i].identifiable,
-            "why": told[i].reason,
+            "identifiable": verdicts[i].identifiable,
+            "why": verdicts[i].reason,
         }
         for i, p in enumerate(result.space.parameters)
     ]

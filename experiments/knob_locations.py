@@ -48,7 +48,7 @@ class Arguments(Options):
     """Options of the experiment."""
 
     knobs: tuple[int, ...] = (0, 1, 2, 3)
-    """Which places."""
+    """Places of the knob."""
 
 
 def case(knob: int, seed: int, setting: Setting, arguments: Arguments, code: Mapping[str, Any]) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class Arguments:
     counts: Counts = field(default_factory=Counts)
     """Cases of each scene."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     commit: str = "HEAD"
     """Commit that froze the method: seeds derive from it.  "development" draws cases to tune with."""
     out: Path = ROOT / "runs" / "null_calibration"

@@ -67,13 +67,13 @@ class Arguments:
     """Options of the experiment."""
 
     setting: str = "paper"
-    """Of Table II."""
+    """Setting of Table II."""
     frictions: tuple[float, ...] = (0.05, 0.005)
     """Sliding frictions of both pads."""
     trials: int = 20
     """Trials of each policy at each friction."""
     policies: Path = REPORTED
-    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
+    """Folder of the policies of table2.py; default: the reported ones in benchmarks/results/archive."""
     quick: bool = False
     """One policy of each method, one short trial: shows that it runs."""
     out: Path = RESULTS

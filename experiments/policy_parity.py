@@ -64,15 +64,15 @@ class Arguments:
     """Options."""
 
     policies: tuple[Path, ...] = (ROOT / "runs" / "train" / "policy.npz",)
-    """As `train` writes them, or an experiment with policies; what each was trained on lies beside it."""
+    """Policies of `train` or of an experiment, each with its distribution beside it."""
     quick: bool = False
-    """A policy that has learned nothing, on two doors: shows that it runs."""
+    """An untrained policy on two doors: shows that it runs."""
     out: Path = RESULTS
     """Folder of the results."""
     doors: int = 50
     """Doors of each policy, one episode each."""
     seed: int = 0
-    """Of the first policy's doors; each further policy's is one more, so that no door is counted twice."""
+    """Seed of the first policy's doors; each further policy has the next seed, so that no door is counted twice."""
 
 
 def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:

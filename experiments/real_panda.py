@@ -330,7 +330,8 @@ def show(model: str, result: dict[str, Any]) -> None:
         print(f"  {'Coulomb ' + key:24s} {'  '.join(f'{v:6.3f}' for v in result['coulomb'][key])}")
     silent = [p["name"] for p in result["parameters"] if not p["identifiable"] and not p["nuisance"]]
     print(
-        f"  {model}: {result['joints_halved']} of 7 joints halved; this log tells little of: {', '.join(silent) or '-'}"
+        f"  {model}: {result['joints_halved']} of 7 joints halved; not identifiable from this log: "
+        f"{', '.join(silent) or '-'}"
     )
 
 

@@ -61,10 +61,10 @@ def figures(found: Run) -> dict[str, Any]:
 
 def made_by(found: Run) -> dict[str, Any]:
     """Origin of the run, as `origin` states it; a figure that is drawn again keeps the origin of its run."""
-    told = found.config
-    versions = {name: version for name, version in told.versions.items() if name != "git"}
-    of = {"commit": told.versions.get("git"), "versions": versions, "device": told.device, "seed": told.seed}
-    return {**of, "date": told.started}
+    config = found.config
+    versions = {name: version for name, version in config.versions.items() if name != "git"}
+    of = {"commit": config.versions.get("git"), "versions": versions, "device": config.device, "seed": config.seed}
+    return {**of, "date": config.started}
 
 
 def main() -> None:

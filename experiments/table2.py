@@ -54,9 +54,9 @@ class Arguments(Options):
     """Options of the experiment."""
 
     settings: tuple[str, ...] = tuple(SETTINGS)
-    """Which doors."""
+    """Settings of Table II."""
     methods: tuple[Method, ...] = METHODS
-    """Which methods."""
+    """Methods to train."""
 
 
 def case(method: Method, seed: int, setting: Setting, arguments: Options, code: Mapping[str, Any]) -> dict[str, Any]:
