@@ -44,8 +44,7 @@ _KINDS = (
 
 
 def kind_of(path: Path) -> str:
-    """Kind of the file at a path: "a file", "a folder", "a device", ...; links are not followed; empty where none
-    is."""
+    """Kind of a path: "a file", "a folder", "a device", ...; links are not followed; empty where none exists."""
     try:
         mode = os.lstat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):

@@ -75,8 +75,7 @@ class Arguments(Options):
 
 
 def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
-    """The effects asked for, or all effects that a policy can be tried with, also on the hinge where they can act
-    there."""
+    """The effects asked for, or all that a policy can be tried with, also on the hinge where possible."""
     if arguments.hide:
         return [one for entry in arguments.hide for one in as_applied(hidden_effects([entry], scene))]
     found = []

@@ -118,8 +118,7 @@ def exact(truth: Truth, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_mujoco(truth: Truth, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [T] rad and servo torques [T] N m by plain C MuJoCo at STEP, with its default, soft friction
-    constraint."""
+    """Positions [T] rad and servo torques [T] N m by plain C MuJoCo at STEP, with its default soft friction."""
     model = mujoco.MjModel.from_xml_string(model_xml(truth, STEP))
     data = mujoco.MjData(model)
     data.qpos[0] = command[0]

@@ -75,8 +75,7 @@ class Search:
 
 
 def settings(motion_cutoff: float, seed: int) -> DiscrepancyConfig:
-    """Settings without search and restarts before the refinement, since inverse dynamics is smooth in its
-    parameters."""
+    """Settings without a search before the refinement: inverse dynamics is smooth in its parameters."""
     return DiscrepancyConfig(
         refine=RefineConfig(iterations=12, basin_hops=0, spreads=0),
         compare=CompareConfig(whitened=True, motion_cutoff=motion_cutoff),
@@ -135,8 +134,7 @@ def as_known(effect: Effect) -> Effect:
 
 
 def adding(log: LoneLog, values: np.ndarray, added: Mapping[str, float]) -> LoneLog:
-    """The log, with the change that parameters `added` make in the simulation at `values` [D] added to its
-    measurement."""
+    """The log plus the change of the simulation by the parameters `added`, at `values` [D]."""
     without, with_it = log.simulated(np.stack([values, _changed(log, values, added)]))
     return log.with_torques(log.measured + with_it - without)
 

@@ -1,5 +1,4 @@
-"""What does the model of a real servo lack, by positions alone? Logs at two gains are searched, those of the third
-test.
+"""What does a real servo's model lack, by positions alone?  Two gains are searched, the third is the test.
 
     python experiments/gap_xl330.py --data DIR
 

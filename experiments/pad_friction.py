@@ -1,5 +1,4 @@
-"""Do the policies of Table II need their grip? Each is tried on the synthetic robot with pads of less and less
-friction.
+"""Do the policies of Table II need their grip?  Each is tried with pads of less and less friction.
 
     python experiments/pad_friction.py [--quick] [--out DIR] [--setting paper] [--frictions 0.05 0.005]
 

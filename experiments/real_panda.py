@@ -217,8 +217,7 @@ def cut(recording: Recording) -> tuple[Recording, Recording]:
 
 
 def fit_models(scene: Scene, parts: tuple[Recording, Recording], config: RealPanda) -> dict[str, Any]:
-    """For every model its estimate, its residuals [K, J] on both parts before and after, and the history of the
-    search."""
+    """For every model: estimate, residuals [K, J] on both parts before and after, history of the search."""
     out: dict[str, Any] = {}
     friction = np.empty(0)
     for model in MODELS[:1] if config.quick else MODELS:

@@ -111,8 +111,7 @@ def has_model(folder: Path) -> bool:
 
 
 def untrainable(folder: Path) -> tuple[str, ...]:
-    """Effects of a folder's extended model with which no policy can be trained: they need the whole command in
-    advance."""
+    """Effects of a folder's extended model that need the whole command in advance, so that no policy can be trained."""
     from droid_jax.door.scene import door_scene
     from droid_jax.identify.extended_model import load_extended
 

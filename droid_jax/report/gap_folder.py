@@ -389,8 +389,7 @@ class Gap:
 
     @property
     def repeated(self) -> bool:
-        """Whether there are repeats, which give the noise; without them alternating blocks of time train and
-        validate."""
+        """Whether there are repeats; without them alternating blocks of time train and validate."""
         return self.found.split.by not in ("blocks", "windows")
 
     @property

@@ -149,8 +149,7 @@ def _trained(now: Any) -> str:
 
 
 class Lines:
-    """Lines in place of bars: one where a stage begins, then at most one every LINE_PERIOD seconds and one at its
-    end."""
+    """Lines in place of bars: at the beginning and end of a stage, and at most every LINE_PERIOD seconds."""
 
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, line: Callable[[str, Any], dict[str, Any]] | None = None

@@ -261,8 +261,7 @@ def _draw(folder: Path | None) -> None:
 
 
 def _seen_whole(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Set camera and size of marks by joints and centres of mass, since MuJoCo's extent is too large for some
-    models."""
+    """Set camera and marks by joints and centres of mass; MuJoCo's extent is too large for some models."""
     import mujoco
 
     mujoco.mj_forward(model, data)

@@ -270,8 +270,7 @@ def drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *a
 
 
 def _inline(figure: Figure, stem: str, kind: str, title: str) -> Markup:
-    """SVG, or PNG on a white card where the SVG would be too long; the caption is its description for screen
-    readers."""
+    """SVG, or PNG on a white card where the SVG would be too long; the caption describes it."""
     svg = inline_svg(figure, f"{stem}-{kind}")
     points = 72 * figure.get_figwidth()
     if len(svg) <= SVG_LIMIT:
