@@ -159,7 +159,7 @@ def rehearsal_sentences(result: Result) -> list[str]:
         f"{len(lost)} at no size within bounds" + (f"; {len(doubtful)} doubtful." if doubtful else ".")
     )
     if doubtful:
-        out.append(f"These would be seen, but probably under another name: {_doubts(doubtful)}.")
+        out.append(f"These would be seen, but probably not named correctly: {_doubts(doubtful)}.")
     if lost:
         out.append(f"At no size: {_by_effect(lost, best)}.")
     if alike := _alike(found):
