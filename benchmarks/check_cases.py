@@ -234,7 +234,7 @@ def _channel(r: Recording, name: str, change: Callable[[np.ndarray], np.ndarray]
 
 
 def _positions(r: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """Scale positions and commands alike."""
+    """Change positions and commands alike."""
     changed = _channel(r, "position", change)
     return replace(changed, command=change(r.command)) if r.command.size else changed
 

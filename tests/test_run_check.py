@@ -71,7 +71,7 @@ def test_a_wrong_unit_is_on_the_terminal_in_the_page_and_in_the_json(
     assert "in degrees" in page and "<svg" in page and "shoulder" in page
     assert main(["check", "--recording", str(path), "--out", str(out)]) == 0  # again, without a scene
     assert ("units", "certain") not in found(out)
-    assert "Without a scene: units, signs and gains were not judged" in (out / "check.html").read_text()
+    assert "Without a scene: units, signs and gains were not checked" in (out / "check.html").read_text()
 
 
 def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

@@ -653,7 +653,7 @@ def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixtur
     said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "--units", "angle=rad", "--joints", *JOINTS]
     given = ["--stiffness", "20", "20", "--damping", "0", "1"]
     assert main(["convert", str(path), *said, *given, "--out", str(out / "kp200.npz")]) == 0
-    assert "but its own --stiffness and --damping: servo gains are of one log" in capsys.readouterr().out
+    assert "except --stiffness and --damping: servo gains belong to one log" in capsys.readouterr().out
     gains = load_recording(out / "kp200.npz").gains
     assert gains is not None and gains.stiffness.tolist() == [20.0, 20.0]
     assert main(["convert", str(path), "--out", str(out / "kp800.npz")]) == 0
@@ -743,7 +743,12 @@ def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pyt
             "/x",
         ): "--state-topic is for ROS bags",
         ("--map", "droid"): "no column 'action/joint_position'",
-        ("--map", str(out / "one.map.toml"), "--columns", "torque=tau{n}"): "maps a torque but does not say which",
+        (
+            "--map",
+            str(out / "one.map.toml"),
+            "--columns",
+            "torque=tau{n}",
+        ): "maps a torque but does not state its convention",
     }.items():
         assert main(["convert", str(first), *words, "--out", str(tmp_path / "no.npz")]) == 2
         assert error in capsys.readouterr().err

@@ -187,7 +187,7 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_text("x")
     fails(tmp_path / "a.bag", "pass joints and torque as well")
     save_recording(make(), tmp_path / "a.npz")
-    fails(tmp_path / "a.npz", "takes no option jonts", jonts=["j1"])
+    fails(tmp_path / "a.npz", "there is no option jonts", jonts=["j1"])
 
 
 def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatch) -> None:

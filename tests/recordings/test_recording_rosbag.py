@@ -721,7 +721,7 @@ def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFix
         ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
         ([], "needs the files or folders to read"),
         ([paths[0], tmp_path / "gone.npz"], "gone.npz does not exist"),
-        ([tmp_path / "log.npz", tmp_path / "log.npz"], "log.npz is no ROS bag: of several sources each is"),
+        ([tmp_path / "log.npz", tmp_path / "log.npz"], "log.npz is no ROS bag: several sources must all be"),
     ]:
         assert convert(*arguments, "--out", out) == 2
         said = capsys.readouterr().err
