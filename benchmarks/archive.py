@@ -2,12 +2,12 @@
 
     python benchmarks/archive.py list                     # what is there
     python benchmarks/archive.py unpack NAME [--out DIR]  # as the folder that experiments/ writes and scores
-    python benchmarks/archive.py pack NAME --folder DIR   # the other way, with its line in manifest.json
+    python benchmarks/archive.py pack NAME --folder DIR   # make an archive, and its entry in manifest.json
     python benchmarks/archive.py check                    # every archive against its SHA-256 in manifest.json
 
-An archive is an xz stream of one line of JSON a file: its `path` in the folder and its `text`, or `base64` where it is
-no text.  Files come back byte for byte.  Runs of one kind, named KIND_COMMIT, lie one stream after the other in
-KIND.jsonl.xz; manifest.json says where each starts, and its SHA-256.
+An archive is an xz stream with one line of JSON per file: its `path` in the folder and its `text`, or `base64` if it is
+not text.  Files are restored byte for byte.  KIND.jsonl.xz holds the streams of all runs named KIND_COMMIT, one after
+the other; manifest.json holds the start and SHA-256 of each.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Unpack:
     """Write the files of an archive."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Of the archive."""
+    """Name of the archive."""
     out: Path | None = None
     """Folder; default: runs/NAME."""
     place: Path = PLACE
@@ -71,9 +71,9 @@ class Pack:
     """Make an archive of a folder's files, without locks."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Of the archive."""
+    """Name of the archive."""
     folder: Path
-    """Whose files are packed."""
+    """Folder whose files are packed."""
     place: Path = PLACE
     """Folder of the archives."""
 
@@ -99,19 +99,19 @@ def pack(folder: Path, place: Path, name: str) -> Path:
 
 
 def file_of(name: str) -> str:
-    """The file that an archive lies in: that of its kind where its name ends with a commit, else its own."""
+    """The file of an archive: that of its kind where its name ends with a commit, else one of its own."""
     return re.sub(r"_[0-9a-f]{7}$", "", name) + ENDING
 
 
 def stream(place: Path, entry: dict[str, Any]) -> bytes:
-    """The compressed bytes of an archive, as the manifest says where they are."""
+    """The compressed bytes of an archive, at the place that the manifest states."""
     with (place / entry["file"]).open("rb") as file:
         file.seek(entry["start"])
         return file.read(entry["bytes"])
 
 
 def unpack(name: str, folder: Path, place: Path = PLACE) -> int:
-    """Write the files of an archive into a folder; how many.  ValueError where it is not of `pack`."""
+    """Write the files of an archive into a folder; returns their number.  ValueError where `pack` did not write it."""
     count = 0
     for path, content in contents(stream(place, manifest(place)[name]), name):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +121,7 @@ def unpack(name: str, folder: Path, place: Path = PLACE) -> int:
 
 
 def contents(data: bytes, name: str) -> Iterator[tuple[PurePosixPath, bytes]]:
-    """Path and content of every file in an archive's bytes; ValueError, with its name, where it is not of `pack`."""
+    """Path and content of every file in an archive's bytes; ValueError where `pack` did not write it."""
     total = 0
     try:
         with lzma.open(io.BytesIO(data), "rt", encoding="utf-8") as lines:
@@ -146,7 +146,7 @@ def manifest(place: Path) -> dict[str, dict[str, Any]]:
 
 
 def faults(place: Path) -> list[str]:
-    """What is wrong with the archives of a folder, a sentence each."""
+    """Faults of the archives in a folder, one sentence each."""
     known, out = manifest(place), []
     files = sorted({entry["file"] for entry in known.values()} | {p.name for p in place.glob(f"*{ENDING}")})
     for file in files:

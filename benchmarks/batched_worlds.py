@@ -4,8 +4,8 @@
 
 For each fit (a folder with fitted.json, apply_fit.py, mjlab_terms.py and fitted.xml) a process of each given Python
 puts draws into the worlds: in mujoco_warp with the arrays of `apply_fit.batch`, in mjlab with its event term.  It then
-steps all worlds with the same commands and each draw in plain C MuJoCo.  Both engines work in single precision.  Their
-difference at the fitted values, without any draw, is the measure of what the draws may differ by.
+steps all worlds with the same commands, and each draw in plain C MuJoCo.  mujoco_warp and mjlab work in single
+precision.  Their difference from C at the fitted values, without any draw, is the scale for the draws' differences.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ class BatchedWorlds:
     mjlab: Path | None = None
     """Python that has mjlab."""
     worlds: int = 8
-    """Worlds, each with a draw of its own."""
+    """Worlds, each with another draw."""
     seconds: float = 1.0
     """Simulated time."""
     out: Path = Path(__file__).resolve().parent / "results"
@@ -212,7 +212,7 @@ def main(config: BatchedWorlds) -> None:
 
 
 def child(engine: str, folder: Path, worlds: int, seconds: float, out: Path) -> None:
-    """What a Python without this package runs."""
+    """The work of a Python without this package."""
     sys.path[:] = [str(folder), *(p for p in sys.path if Path(p).resolve() != Path(__file__).resolve().parent)]
     mjcf = folder / json.loads((folder / "fitted.json").read_text())["mjcf"]["file"]
     out.write_text(json.dumps(CASES[engine](folder, mjcf, worlds, seconds)))

@@ -1,9 +1,9 @@
-"""What a candidate effect costs: the replay that holds all of them, and every stage of a search per candidate.
+"""Computing time of candidate effects: a replay with all of them, and each stage of a search per candidate.
 
     python benchmarks/candidates.py [--quick] [--out DIR]
 
 On the built-in door at a 4 ms step, demonstration A: the replay with the whole library at neutral beside the one with
-no effect at all (interleaved), and what screening, a first look and a refit take of it in rows.
+no effect (interleaved), and the rows that screening, a first look and a refit need.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Arguments:
 
 
 def recording(quick: bool) -> Recording:
-    """Two repeats of the synthetic robot: what they hold does not matter here."""
+    """Two repeats of the synthetic robot; their content does not matter here."""
     scene, demonstration = door_scene(), load_recording(demonstration_path("A"))
     if quick:
         first = float(demonstration.time[0])

@@ -1,11 +1,11 @@
-"""Does the check of a log find the errors that are put into it, and is it silent where a log is right?
+"""Does the check of a log find errors that are put into it, and nothing in correct logs?
 
     python benchmarks/check.py [--quick] [--real DIR] [--out DIR]
 
 Every error of check_cases.py is put into synthetic logs of a two-link arm and into one real log of each robot, and the
-findings are counted: the one that names the error, others, none.  The same logs, and 100 synthetic ones, are checked as
-they are; then every finding is false.  Of the logs with the most joints the whole command is timed too, with the
-parameters of their pages and as a process of its own: first with an empty cache of compiled programs, then again.  DIR
+findings are counted: the one that names the error, others, none.  The same logs and 100 synthetic ones are also checked
+without an error; then every finding is false.  For the logs with the most joints the whole command is timed in a
+separate process, with the parameters of their pages: first with an empty cache of compiled programs, then again.  DIR
 holds the public logs (so101, bam_xl330, go2_leg, franka_gaz2019, emps, door_pr2_ikea), which are not part of this
 repository; without it only synthetic logs are checked.
 """
@@ -71,7 +71,7 @@ class Check:
 
 
 def findings(case: Case) -> tuple[list[Finding], float]:
-    """What `check` finds, and the CPU seconds it took."""
+    """Findings of `check`, and its CPU seconds."""
     begin = time.process_time()  # what other programs take of the machine does not count
     try:
         validate(case.recording, allow_jitter=True)
@@ -83,7 +83,7 @@ def findings(case: Case) -> tuple[list[Finding], float]:
 
 
 def timed(folder: Path) -> dict[str, dict[str, float]]:
-    """Wall and CPU seconds of `check` with parameters, a process of its own, of the logs with the most joints."""
+    """Wall and CPU seconds of `check` with parameters in a separate process, for the logs with the most joints."""
     found = {}
     for case in real(folder):
         if case.name not in PAGES:

@@ -49,7 +49,7 @@ _LEG = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator=
 class Case:
     """A log with the scene that it is checked in.
 
-    known: kinds of findings that are right about the log as it is.
+    known: kinds of findings that are correct about the unchanged log.
     """
 
     name: str
@@ -70,9 +70,9 @@ def two_link() -> Scene:
 def played(
     model: mujoco.MjModel, control: np.ndarray, start: np.ndarray, late: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[T, J] torques and positions that C MuJoCo logs at RATE, in four steps a row.
+    """Torques and positions [T, J] of C MuJoCo at RATE, four steps per row.
 
-    control: [T, U].  start: [J] rad.  late: steps by which commands take effect late.
+    control: [T, U].  start: [J] rad.  late: delay of the commands in steps.
     """
     data = mujoco.MjData(model)
     torque, position = np.empty((2, len(control), model.nq))
@@ -89,7 +89,7 @@ def played(
 def measured(
     time: np.ndarray, torque: np.ndarray, position: np.ndarray, repeats: int, rng: np.random.Generator
 ) -> dict[str, Channel]:
-    """The channels of so many repeats of torques and positions [T, J], with noise."""
+    """Channels of several repeats of torques and positions [T, J], with noise."""
     torque = torque + rng.normal(0.0, 0.05, (repeats, *torque.shape))
     position = position + rng.normal(0.0, 2e-4, (repeats, *position.shape))
     mask = np.ones(torque.shape, bool)
@@ -134,7 +134,7 @@ def synthetic(seed: int, scene: Scene) -> Case:
 
 
 def real(folder: Path) -> Iterator[Case]:
-    """The public logs in a folder, as far as they are there: so101, bam_xl330, go2_leg, franka_gaz2019, emps,
+    """The public logs in a folder, as far as they exist: so101, bam_xl330, go2_leg, franka_gaz2019, emps,
     door_pr2_ikea.
     """
     rad = Units(angle="rad", torque="N m", time="s")
@@ -205,7 +205,7 @@ def _read(path: Path, columns: ColumnMap) -> Recording:
 class Error:
     """A wrong use of a log.
 
-    kinds: of findings that name it.  words: one of them must stand in its sentence.
+    kinds: of findings that name it.  words: one of them must be in the finding's sentence.
     applies: whether it can be put into a recording.  put: does it.  scene: changes the scene.
     """
 
@@ -234,7 +234,7 @@ def _channel(r: Recording, name: str, change: Callable[[np.ndarray], np.ndarray]
 
 
 def _positions(r: Recording, change: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """Positions and commands alike."""
+    """Change positions and commands alike."""
     changed = _channel(r, "position", change)
     return replace(changed, command=change(r.command)) if r.command.size else changed
 
@@ -271,13 +271,13 @@ def _no_gains(r: Recording) -> Recording:
 
 
 def _late(r: Recording, seconds: float) -> Recording:
-    """Measurements that are stamped later than they were taken."""
+    """Measurements with stamps later than the true times."""
     channels = {key: replace(c, time=c.time + seconds) for key, c in r.channels.items()}
     return replace(r, channels=channels)
 
 
 def _nominal(r: Recording) -> Recording:
-    """Commands by a nominal rate that their stamps do not have."""
+    """Commands at a nominal rate that differs from that of their stamps."""
     return replace(r, time=r.time * 0.985)
 
 
@@ -322,7 +322,7 @@ def _several_commands(c: Case) -> bool:
 
 
 def of(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recording], Recording]:
-    """What changes a channel, or the command."""
+    """A function that changes a channel, or the command."""
     if name == "command":
         return lambda r: replace(r, command=change(r.command))
     return lambda r: _channel(r, name, change)
@@ -345,12 +345,12 @@ def _register(values: np.ndarray) -> np.ndarray:
 
 
 def _per_cent(values: np.ndarray) -> np.ndarray:
-    """Of what each joint's drive can do, a fifth more than its largest torque here."""
+    """Per cent of each joint's rated torque, which is a fifth above the largest torque of the log."""
     return 100.0 * values / (1.2 * np.nanmax(np.abs(values), axis=(0, 1)))
 
 
 def _crosses(c: Case) -> bool:
-    """Whether every torque changes its sign, so that it is lost in a magnitude."""
+    """Whether every torque changes its sign, so that a magnitude loses information."""
     if not _torque(c):
         return False
     values = c.recording.channels["torque"].values
@@ -364,7 +364,7 @@ def magnitude(values: np.ndarray) -> np.ndarray:
 
 
 def _standing(r: Recording) -> Recording:
-    """The first instant, throughout; its noise stays."""
+    """The value of the first instant throughout, with the noise of the log."""
 
     def stopped(values: np.ndarray) -> np.ndarray:
         return values[:, :1] + 1e-4 * np.sin(7.0 * np.arange(values.shape[1]))[None, :, None]
@@ -409,7 +409,7 @@ def _limited(share: float, torque: bool) -> Callable[[Case], Scene]:
 
 
 def _floating(case: Case) -> Scene:
-    """The robot on a base that nothing holds."""
+    """The robot on a floating base."""
     base = '<body name="loose_base"><freejoint/><inertial pos="0 0 0" mass="5" diaginertia="0.1 0.1 0.1"/>'
     before, _, after = case.scene.spec.to_xml().partition("<worldbody>")
     xml = f"{before}<worldbody>{base}{after}".replace("</worldbody>", "</body></worldbody>")
@@ -443,7 +443,7 @@ def _apart(r: Recording) -> Recording:
 
 
 def _turned_round(values: np.ndarray) -> np.ndarray:
-    """Every joint's column under the next one's name."""
+    """Every joint's column under the name of the next joint."""
     return np.roll(values, 1, axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""What the benchmark scripts share: fair timing, processes of their own, and where a result comes from."""
+"""Functions of the benchmark scripts: fair timing, separate processes, and the origin of a result."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CODE = runtime.versions()
 
 
 def origin(seed: int) -> dict[str, Any]:
-    """Where a result comes from: commit and versions when the program started, device, cores, seed, date.
+    """Origin of a result: commit and versions when the program started, device, cores, seed, date.
 
     Starts jax's backend.
     """
@@ -44,21 +44,21 @@ def origin(seed: int) -> dict[str, Any]:
 
 
 def commits(cases: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The commits that made some cases, which are kept from run to run: {"origin": {"commit": ...}, ...} each."""
+    """The commits that made some kept cases: {"origin": {"commit": ...}, ...} each."""
     return sorted({str(case["origin"]["commit"]) for case in cases})
 
 
 def stem(name: str, quick: bool) -> str:
-    """Name of a result: what --quick writes stands beside the figures that are kept, never over them."""
+    """Name of a result; results of --quick have another name, so that they never replace others."""
     return f"{name}_quick" if quick else name
 
 
 def publish(
     folder: Path, name: str, quick: bool, seed: int, result: Mapping[str, Any], line: Mapping[str, Any] | None = None
 ) -> None:
-    """The end of a script: writes FOLDER/NAME.json, where it comes from first, and prints one last line of JSON.
+    """Write FOLDER/NAME.json, beginning with its origin, and print one last line of JSON.
 
-    line: what is printed; default: all that is written.  Starts jax's backend, as `origin` does.
+    line: the printed content; by default all of the file.  Starts jax's backend, as `origin` does.
     """
     whole = {**origin(seed), **result}
     write_json(folder / f"{stem(name, quick)}.json", whole, indent=2)
@@ -66,9 +66,9 @@ def publish(
 
 
 def empty_cache(folder: str) -> dict[str, str]:
-    """An environment, for a process of its own, in which nothing has been compiled yet.
+    """Environment variables for a separate process with an empty compilation cache.
 
-    Without the log level that an imported jax leaves behind, under which XLA says more than in a fresh terminal.
+    The log level that an imported jax sets is removed: with it, XLA prints more than in a fresh terminal.
     """
     given = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     path = os.pathsep.join(filter(None, (str(ROOT), given.get("PYTHONPATH"))))
@@ -126,7 +126,7 @@ def in_process(
     """Run a benchmark script in a process of its own and return the JSON object on its last line.
 
     timeout: s.  environment: replaces this process's own.
-    What goes wrong is a result too: {"error": ...} says that it took too long or how it failed.
+    A failure is a result too: {"error": ...} states that the process took too long, or its error.
     """
     command = [sys.executable, str(script), *arguments]
     where = dict(os.environ if environment is None else environment)

@@ -1,11 +1,11 @@
-"""The default command as a new user has it: how long until it speaks, what each stage takes, what comes of it.
+"""The default command for a new user: time to the first line, time of each stage, and results.
 
     python benchmarks/default_run.py [--against CHECKOUT] [--quick] [--out DIR]
 
-Starts `python -m droid_jax.run` without options but its folder, in a process of its own and with an empty compilation
-cache, and keeps what it prints with the time of every line.  With --against the same command of another commit runs
-after it, and then this one's once more, with what it has compiled.  Writes DIR/default_run.json, first as soon as one
-run has ended; the run's folder, with the page, is left in DIR/default_run.
+Runs `python -m droid_jax.run` with no option but its folder, in a separate process with an empty compilation cache, and
+stores its output with the time of every line.  With --against, the same command of another commit runs afterwards, and
+then this commit's once more with its compiled programs.  Writes DIR/default_run.json after each run.  The run's folder,
+with the page, stays in DIR/default_run.
 """
 
 from __future__ import annotations
@@ -52,14 +52,16 @@ class Arguments:
 
 
 class Line(NamedTuple):
-    """What the command printed, and how many seconds after it was started."""
+    """A printed line, and its time after the start in seconds."""
 
     seconds: float
     text: str
 
 
 def command_lines(out: Path, cache: str, program: Path | None = None) -> Iterator[Line]:
-    """Lines of a checkout's command as they come; the one who stops asking stops it.  RuntimeError where it fails.
+    """Lines of a checkout's command as they are printed; closing the generator stops the command.
+
+    RuntimeError where the command fails.
 
     It starts over where the folder holds a run, and in the folder above, so that no line names this machine's folders.
     """
@@ -128,7 +130,7 @@ def figures(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def results(out: Path) -> dict[str, Any]:
-    """What a run found: the gap before and after, the verdict beside what was hidden, success of the policy."""
+    """Results of a run: gap before and after, verdict and hidden effect, success of the policy."""
     fit, gap, transfer = (
         json.loads((out / name).read_text()) for name in ("identify/fit.json", "gap/gap.json", f"train/{TRANSFER}")
     )
@@ -166,7 +168,7 @@ def main() -> None:
 
 
 def ratios(found: dict[str, Any], paired: dict[str, Any]) -> dict[str, float]:
-    """Of the whole command's minutes to the other commit's, with an empty cache and with its own: those there are."""
+    """Ratios of the command's minutes to the other commit's, with an empty cache and with its own, where measured."""
     if "against" not in paired or "effects" not in paired["against"]:  # a quick one
         return {}
     before = paired["against"]["whole_minutes"]

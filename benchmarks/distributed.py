@@ -1,14 +1,13 @@
-"""One identification in 1, 2 and 4 processes on this machine: the same fit, how long, and what a lost process does.
+"""One identification in 1, 2 and 4 processes on this machine: equality of fits, time, and loss of a process.
 
     python benchmarks/distributed.py [--quick] [--out DIR]
 
 `python -m droid_jax.run identify` of the tutorial's arm, its processes joined by jax.distributed, one CPU device each;
 and once in one process with four virtual devices.  All numbers of the fit are compared with those of one process.
-Fewer rows at once on a device change the rounding: of the four devices the shift of the values is reported, in
-deviations of the fitted Gaussian.
-Then a worker is killed in the middle of the search, in another run it is stopped (as a host that no longer answers),
-and the killed run goes on in one process.  On a machine with fewer cores than processes the seconds say what the
-processes cost, not what they gain.
+Fewer rows at once on a device change the rounding: for the four devices the shift of the values is reported, in
+deviations of the fitted Gaussian.  Then a worker is killed in the middle of a search, and the run is continued in one
+process.  In another run a worker is stopped, like a host that no longer answers.  On a machine with fewer cores than
+processes the times show the cost of the processes, not their gain.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class Arguments:
     population: int = 128
     """Samples of a generation."""
     generations: int = 30
-    """Of the search."""
+    """Generations of the search."""
 
 
 def start(
@@ -99,7 +98,7 @@ def start(
 
 @contextlib.contextmanager
 def running(processes: list[subprocess.Popen[bytes]]) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """No process outlives the block."""
+    """Context in which processes run; all of them are ended when the block ends."""
     try:
         yield processes
     finally:
@@ -166,7 +165,7 @@ def lose(words: Sequence[str], out: Path, place: Path, number: int, by: signal.S
         began = time.monotonic()
         code = processes[0].wait(LONGEST)
         seconds = time.monotonic() - began
-    time.sleep(1.0)  # its guard has the last word
+    time.sleep(1.0)  # its guard prints the last line
     said = (place / f"lost{number}.0").read_text(errors="replace").strip().splitlines()
     return {"seconds": seconds, "code": code, "said": next((x for x in reversed(said) if x.startswith("error")), "")}
 

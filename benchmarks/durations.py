@@ -3,8 +3,8 @@
     python benchmarks/durations.py [--quick] [--out DIR] [--warm] [--processes N] [--paths PATH ...]
 
 Runs pytest as `.ci/run` does and writes DIR/durations.json.  CPU seconds count user and system time of the test's own
-process and of the processes that it started and that have ended.  They do not grow beside other work; wall time does.
-The suite starts with an empty compilation cache, as a fresh checkout does, unless --warm is given.
+process and of the processes that it started and that have ended.  Unlike wall time, they do not depend on other work
+of the machine.  The suite starts with an empty compilation cache, as a fresh checkout does, unless --warm is given.
 
 The functions pytest_* below are the plugin that measures: `pytest -p benchmarks.durations --durations-json FILE`.
 """
@@ -79,7 +79,7 @@ def main(arguments: Arguments) -> None:
 
 
 def summary(tests: dict[str, float], total: float) -> dict[str, Any]:
-    """What durations.json says of the measured tests.
+    """Content of durations.json for the measured tests.
 
     Args:
         tests: CPU s of each test by its node id.
@@ -114,7 +114,7 @@ def cpu_seconds() -> float:
 
 
 class CpuClock:
-    """Adds CPU seconds to each test report; where reports come together, it sums and writes them."""
+    """Plugin that adds CPU seconds to each test report; the controller sums and writes them."""
 
     def __init__(self, config: pytest.Config) -> None:
         self.config, self.last = config, cpu_seconds()

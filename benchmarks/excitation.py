@@ -1,13 +1,13 @@
-"""Does a fit tell the parameters that `check --parameters` says it will, also those that its proposed motion adds?
+"""Does a fit identify the parameters that `check --parameters` predicts, also with its proposed motion?
 
     python benchmarks/excitation.py [--quick] [--real DIR] [--out DIR]
 
 Poor motions of a two-link arm (one joint at rest, slow, small, quick), recorded in C MuJoCo on arms with other masses,
-damping, friction and armature.  Of each: what the check says of its nine parameters beside what a fit then finds; and
-the proposed motion, recorded on the same arm, and what a fit of both finds.  Likewise poor motions of a Panda, logs
-without commands of torques behind its gears, whose joint friction is fitted.  With --real DIR also the log of a real
-Panda (franka_gaz2019): beside a fit of the same log, and beside the committed fit of experiments/real_panda.py, which
-is another program's path: its own filter and time blocks.
+damping, friction and armature.  For each, the check's prediction for nine parameters is compared with a fit.  The
+proposed motion is then recorded on the same arm, and both motions are fitted.  The same is done for poor motions of a
+Panda: logs without commands, with link-side torques, whose joint friction is fitted.  With --real DIR it is done for
+the log of a real Panda (franka_gaz2019), which is also compared with the committed fit of experiments/real_panda.py.
+That fit has another filter and other time blocks.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ FITS = IdentifyConfig(
 
 @dataclass(frozen=True)
 class Compared:
-    """Compare what the check says of parameters with what fits find.
+    """Compare the check's predictions for parameters with fits.
 
     real: folder of public logs.  quick: two motions of one arm, one of a Panda.  out: folder of excitation.json.
-    seed: of the arms.  arms: each makes every motion.
+    seed: of the arms.  arms: number of arms; each makes every motion.
     """
 
     real: Path | None = None
@@ -124,7 +124,7 @@ def motion(kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.ndarray, seed: int) -> Recording:
-    """Two repeats without torques are few: one repeat of torques and positions, with noise."""
+    """One repeat of torques and positions, with noise."""
     channels = measured(time, *played(model, command, command[0]), 1, np.random.default_rng(seed))
     start: dict[str, float] = {str(j): float(q) for j, q in zip(JOINTS, command[0], strict=True)}
     return Recording(
@@ -136,13 +136,16 @@ def recorded(name: str, model: mujoco.MjModel, time: np.ndarray, command: np.nda
 def identifiable(
     scene: Scene, space: Space, recordings: Sequence[Recording], config: IdentifyConfig, judge: Sequence[Recording] = ()
 ) -> dict[str, bool]:
-    """What a fit finds.  judge: logs that judge it; without them the last third of a log without commands would."""
+    """Identifiable parameters of a fit.
+
+    judge: test recordings; by default the last third of a log without commands is held out.
+    """
     found = identify_parameters(scene, space, recordings, config=config, judge_on=judge)
     return {t.name: t.identifiable for t in found.identifiability}
 
 
 def said(found: Excitation) -> dict[str, bool]:
-    """What the check says."""
+    """Identifiable parameters by the check."""
     return {t.name: t.identifiable for t in found.identifiability}
 
 
@@ -163,7 +166,7 @@ def of_motion(
     scene: Scene, space: Space, kind: str, seed: int, log: Recording, record: Record, fits: IdentifyConfig,
     judge: Sequence[Recording] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """What is said of a poor log, what a fit finds, and what a fit finds with the motion that is proposed.
+    """Check and fit of a poor log, and fit with the proposed motion in addition.
 
     record: (name, [K] s, [K, J] rad, seed) -> a recording of that motion on the same robot.
     """
@@ -223,7 +226,7 @@ def of_synthetic_panda(kind: str, seed: int) -> dict[str, Any]:
 
 
 def of_panda(folder: Path) -> dict[str, Any] | None:
-    """The Panda's log, its first two thirds, beside a fit of it and beside the committed one."""
+    """Check of the first two thirds of the Panda's log, with a fit of them and with the committed fit."""
     case = next((c for c in real(folder) if c.name == "panda/exciting"), None)
     if case is None:
         return None
@@ -266,7 +269,7 @@ def summary(rows: list[dict[str, Any]], panda: dict[str, Any] | None) -> dict[st
 
 
 def _counted(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How often the check and a fit agree.  Of what a fit leaves open: the share with the addition."""
+    """Counts of agreement of check and fit, and the share of unidentifiable parameters that the addition identifies."""
     agreeing = [row["said"][n] == row["fit"][n] for row in rows for n in row["said"]]
     added = [row["after"][n] for row in rows if "after" in row for n in row["identifiable_by_it"]]
     missing = [(row, n) for row in rows for n, known in row["fit"].items() if not known]

@@ -1,4 +1,4 @@
-"""All that is to be known of a GPU, in one run of at most eight minutes.
+"""All benchmarks on a GPU, in one run of at most eight minutes.
 
     python benchmarks/gpu.py [--quick] [--out DIR] [--only PART ...] [--seconds 480]
 
@@ -7,8 +7,8 @@ the version of jaxlib; for the part "warp" also warp-lang.  On a machine without
 jax-cuda13-plugin, jax-cuda13-pjrt and the nvidia-* packages that they name, mujoco, mujoco-mjx, brax, flax, optax,
 orbax-checkpoint, evosax, scipy, msgspec, filelock, tyro, rich, matplotlib, jinja2, markupsafe, pillow, warp-lang.
 
-Parts, each in a process of its own with its own share of the time; one that fails or is stopped leaves what it has
-measured, and the others go on:
+Each part runs in a separate process with its share of the time.  Where one fails or is stopped, its measurements so far
+are kept and the others run:
 
 | part | measures |
 |---|---|
@@ -19,9 +19,9 @@ measured, and the others go on:
 | ppo | training of the preset "gpu": simulation steps per second, time to 95 % success |
 | gap | a search for the missing effect of one door (a hidden magnetic catch) |
 
-Replay and C engine step the same samples through the same first STEPS steps of demonstration A.  Warp steps one
-model from the same start under the same commands, without parameter samples: what it is compared with is the
-simulation alone.  Writes DIR/gpu.json after every part, and one line of JSON at the end.
+Replay and C engine step the same samples through the first STEPS steps of demonstration A.  Warp steps one model from
+the same start under the same commands, without parameter samples, so that only the simulation is compared.
+Writes DIR/gpu.json after every part, and one line of JSON at the end.
 """
 
 from __future__ import annotations
@@ -68,23 +68,23 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """Small sizes on whatever there is: shows that it runs, its numbers mean nothing."""
+    """Small sizes on any device: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of gpu.json."""
     only: tuple[str, ...] = tuple(SHARES)
-    """Parts; what an earlier run of the same code and samples measured of the others stays."""
+    """Parts to run; results of the others from an earlier run of the same code and samples are kept."""
     seconds: float | None = None
-    """For all parts together; default: 480, with --quick 220."""
+    """Seconds for all parts together; default: 480, with --quick 220."""
     seed: int = 0
-    """Of the samples, the search, the robot and the policy."""
+    """Seed of the samples, the search, the robot and the policy."""
     commit: str = CODE.get("git", "")
-    """Of the code, where no git can say it."""
+    """Commit of the code, where git is missing."""
     part: str = ""
-    """Run this part in this process, and write to --kept: how the script calls itself."""
+    """Run this part in this process, and write to --kept; used by the script itself."""
     kept: Path = Path()
     """File of a part's results."""
     until: float = 0.0
-    """When it is stopped, s since 1970."""
+    """End of the part's time, s since 1970."""
 
     def __post_init__(self) -> None:
         if unknown := [part for part in (*self.only, self.part) if part and part not in SHARES]:
@@ -97,7 +97,7 @@ class Arguments:
 
 
 class Measuring:
-    """What a part has measured so far, on disk after every addition, and how long it may go on."""
+    """Measurements of a part so far, written to disk after every addition, and its remaining time."""
 
     def __init__(self, arguments: Arguments) -> None:
         self.arguments = arguments
@@ -110,12 +110,12 @@ class Measuring:
         return self._until - time.time()
 
     def keep(self, **found: Any) -> None:
-        """Add to what is on disk."""
+        """Add measurements, and write all to disk."""
         self.found |= found
         write_json(self.arguments.kept, self.found)
 
     def while_there_is_time(self, items: Sequence[Any]) -> Iterator[Any]:
-        """The first item, and others as long as the next one should end in time; the rest is noted as left out."""
+        """Yields the first item, and others while the next should end in time; the rest is recorded as left out."""
         longest = 0.0
         for number, item in enumerate(items):
             if number and longest * (1 + STARTING) > self.left:
@@ -347,7 +347,7 @@ def _row(population: int, steps: int, seconds: float) -> dict[str, Any]:
 
 def run_part(arguments: Arguments) -> None:
     """One part, in this process."""
-    if arguments.part == "c":  # its replay's module imports jax: on a GPU it need not take its memory
+    if arguments.part == "c":  # the replay's module imports jax, which need not take the GPU's memory
         os.environ["JAX_PLATFORMS"] = "cpu"
     runtime.tune()
     runtime.import_mjx()
@@ -359,7 +359,7 @@ def run_part(arguments: Arguments) -> None:
 
 
 def in_own_process(part: str, arguments: Arguments, seconds: float, cache: str) -> dict[str, Any]:
-    """What a part has measured in so many seconds; "error" says why it has not ended."""
+    """Measurements of a part within a time limit; "error" states why it did not end."""
     kept = Path(cache) / f"{part}.json"
     options = {"part": part, "kept": kept, "until": time.time() + seconds, "seed": arguments.seed}
     words = [sys.executable, __file__, *(str(word) for k, v in options.items() for word in (f"--{k}", v))]
@@ -383,7 +383,7 @@ def in_own_process(part: str, arguments: Arguments, seconds: float, cache: str) 
 
 
 def headline(parts: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """The figures that are asked for; None where they were not measured."""
+    """The main figures; None where they were not measured."""
 
     def of(part: str, name: str) -> Any:
         return parts.get(part, {}).get(name)
@@ -428,7 +428,7 @@ def main() -> None:
             print(
                 f"{part}: {parts[part]['part_s']:.0f} s of {share:.0f}, {parts[part].get('error', 'done')}", flush=True
             )
-    seconds = time.monotonic() - began  # the device is asked only now: its memory was the parts' own
+    seconds = time.monotonic() - began  # queried only now, so that the parts had the device's memory
     result = {**headline(parts), **origin(arguments.seed), **machine, "seconds": seconds, "parts": parts}
     write_json(path, result, indent=2)
     print(json.dumps({**headline(parts), "device": result["device"], "seconds": seconds}))

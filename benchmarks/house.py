@@ -1,9 +1,9 @@
-"""Figures of the code base itself: how many files, how long the sentences, how long the tests.
+"""Figures of the code base: number of files, length of sentences, time of tests.
 
 python benchmarks/house.py [--gap]
 
-Nothing is run but `git ls-files` and `docs/sentences.py`, and with --gap a small search whose modules are counted.  The
-time of the tests is given or read from durations.json, a newcomer's tasks are read from newcomer.json.
+Runs only `git ls-files` and `docs/sentences.py`, and with --gap a small search whose modules are counted.  The time of
+the tests is given or read from durations.json; a newcomer's tasks are read from newcomer.json.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ def sentence_words() -> float:
 def gap_modules() -> dict[str, list[str]]:
     """Layer -> modules that a search for a missing effect enters, from its start to its verdict.
 
-    The small search of tests/small_gap.py, by the command `gap`, on two recordings.  A module is entered where one of
-    its functions is called while `discrepancy.missing.search` runs; what importing it runs does not count.  Leaves are
-    left out: the modules beside the layers, and report/, which only shows progress meanwhile.
+    The small search of tests/small_gap.py, by the command `gap`, on two recordings.  A module is entered if one of its
+    functions is called while `discrepancy.missing.search` runs, not by importing it.  The modules beside the layers and
+    report/, which only shows progress, are not counted.
     """
     import droid_jax
     from droid_jax import runtime

@@ -1,19 +1,19 @@
-"""Runs that are killed at random moments and resumed: do they end with what an uninterrupted run ends with?
+"""Do runs that are killed at random moments and resumed end with the result of an uninterrupted run?
 
     python benchmarks/kills.py [--quick] [--out DIR] [--only COMMAND ...]
 
 `identify` and `gap` on a log of a lone hinge, `train` on the built-in door, each with a budget of seconds.  Each run is
-killed with SIGKILL, once or twice, at a moment drawn from the seconds that an uninterrupted run takes, and then given
-again until it ends.  Every second training is killed just behind its first or second checkpoint instead: a small one
-compiles for most of its time.  All numbers of a run's files are compared bit for bit with those of the uninterrupted
-run; what names a moment or a duration is left out.
+killed with SIGKILL, once or twice, at a random moment within the duration of an uninterrupted run, and then started
+again until it ends.  Every second training is killed just after its first or second checkpoint instead, because a small
+training compiles for most of its time.  All numbers of a run's files are compared bit for bit with those of the
+uninterrupted run, except moments and durations.
 
-A training goes on from its last checkpoint with Adam's moments and starts drawn anew (`policy.train`), so that it ends
-elsewhere than one that was not stopped.  It is compared with an uninterrupted training (`identical`) and, beside it,
-with one that was stopped just behind the same checkpoint (`as_stopped_there`).
+A resumed training continues from its last checkpoint, with new moments of Adam and newly drawn starts (`policy.train`),
+so that its result differs from that of an uninterrupted one.  It is compared with an uninterrupted training
+(`identical`) and with one that was stopped just after the same checkpoint (`as_stopped_there`).
 
-A script that was stopped goes on: what was done lies in DIR/kills.  Its end writes DIR/kills.json, which
-benchmarks/robustness.py takes up, and prints one line of JSON.
+A stopped script can be continued: its results so far are in DIR/kills.  At the end it writes DIR/kills.json, which
+benchmarks/robustness.py reads, and prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ LONGEST = 3600.0  # s that one process may take, on a machine with much else to 
 FROM, TO = 0.02, 0.98  # of an uninterrupted run's seconds, between which it is killed
 JUST_BEHIND = 0.5  # s behind a checkpoint in which a training is killed that compiles for most of its time
 AGAIN = 0.3  # share of runs that are killed a second time
-# What names a moment, a duration or a place, or says which code ran: no result.
+# Keys of moments, durations, places and code versions, which are not results.
 NOT_COMPARED = {"seconds", "started", "versions", "device", "rate", "left", "setup", "recordings", "seconds_total"}
 HINGE = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="hinge" axis="0 0 1" damping="0.4"/>
 <inertial pos="0.2 0 0" mass="2" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>"""
@@ -62,7 +62,7 @@ ARGUMENTS = {
     "gap": ("gap", *LOG, "--effects", "joint_coulomb", "torque_gain"),
     "train": ("train", "--method", "prior", "--steps", "384"),
 }
-# Three checkpoints, as many as are kept: one that a stop leaves is there in a run without a stop too.
+# Three checkpoints, as many as are kept, so that a stopped run has the same checkpoints as one without a stop.
 SMALL = {"envs": 8, "devices": 1, "hidden": (8,), "unroll": 4, "batch": 8, "minibatches": 1, "epochs": 1,
          "evaluations": 4, "eval_envs": 2}  # fmt: skip
 
@@ -74,11 +74,11 @@ class Arguments:
     quick: bool = False
     """Two runs of each command instead of 20."""
     out: Path = Path("runs/robustness")
-    """Where kills.json is written; what was done lies in its folder kills."""
+    """Folder of kills.json; finished runs are in its subfolder kills."""
     only: tuple[str, ...] = COMMANDS
     """Commands."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the moments."""
 
 
 def main(arguments: Arguments) -> None:
@@ -155,7 +155,7 @@ def write_inputs(place: Path) -> None:
 
 
 def reference(place: Path, command: str) -> float:
-    """Make what an uninterrupted run leaves, twice: everything is compiled then; the seconds of the second."""
+    """Make the uninterrupted run twice, so that everything is compiled; returns the seconds of the second."""
     kept = place / f"{command}_seconds.json"
     if kept.exists():
         return json.loads(kept.read_text())
@@ -173,7 +173,7 @@ def reference(place: Path, command: str) -> float:
 
 
 def killed(place: Path, command: str, number: int, seconds: float, random: Random) -> dict[str, Any]:
-    """One run that is killed and given again until it ends, compared with the reference."""
+    """One run that is killed and restarted until it ends, compared with the reference."""
     out = f"{command}_{number:02d}"
     shutil.rmtree(place / out, ignore_errors=True)
     at, kept = [], 0
@@ -183,7 +183,7 @@ def killed(place: Path, command: str, number: int, seconds: float, random: Rando
         _await_checkpoints(process, place / out, awaited)
         try:
             process.wait(random.uniform(0.0, JUST_BEHIND) if awaited else random.uniform(FROM, TO) * seconds)
-            break  # it was quicker than the reference: nothing was killed
+            break  # it ended before the kill
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
@@ -215,8 +215,8 @@ def _last_checkpoint(folder: Path) -> int:
 
 
 def _as_stopped_there(place: Path, out: str, step: int, kills: int) -> bool:
-    """Whether a training ended as one does that was stopped behind the checkpoint of a step, once."""
-    if kills > 1:  # it went on with moments drawn anew twice
+    """Whether a training's result is that of one that was stopped once, after the checkpoint of a step."""
+    if kills > 1:  # it was resumed twice
         return False
     model = place / f"train_stopped_{step}"
     if not model.exists():
@@ -233,7 +233,7 @@ def _as_stopped_there(place: Path, out: str, step: int, kills: int) -> bool:
 
 
 def start(place: Path, command: str, out: str, said: Any = subprocess.DEVNULL) -> subprocess.Popen[str]:
-    """The command as a process group of its own."""
+    """Start the command in a new process group."""
     given = {name: value for name, value in os.environ.items() if name not in ("TF_CPP_MIN_LOG_LEVEL", "XLA_FLAGS")}
     environment = {**given, "DROID_JAX_CACHE": str(place / "cache"), "PYTHONPATH": str(ROOT), "MUJOCO_GL": "disable"}
     words = [sys.executable, str(Path(__file__).resolve()), "--child", *ARGUMENTS[command], "--out", out]
@@ -243,7 +243,7 @@ def start(place: Path, command: str, out: str, said: Any = subprocess.DEVNULL) -
 
 
 def finish(place: Path, command: str, out: str) -> tuple[int, list[str]]:
-    """Run a command to its end: its exit code, 124 for one that hangs, and what it wrote to stderr."""
+    """Run a command to its end; returns its exit code (124 if it hangs) and its standard error."""
     process = start(place, command, out, subprocess.PIPE)
     try:
         _, said = process.communicate(timeout=LONGEST)
@@ -255,7 +255,7 @@ def finish(place: Path, command: str, out: str) -> tuple[int, list[str]]:
 
 
 def child(words: list[str]) -> int:
-    """The command line with a small training, and with every program in the cache: one that is killed saved some."""
+    """The command line with a small training, which stores every compiled program in the cache."""
     from dataclasses import replace
 
     from droid_jax import runtime
@@ -273,7 +273,7 @@ def child(words: list[str]) -> int:
 
 
 def numbers_of(folder: Path) -> dict[str, bytes]:
-    """What a run says, by file and key; without pictures, checkpoints, and what NOT_COMPARED names."""
+    """Values of a run by file and key, without pictures, checkpoints, and the keys in NOT_COMPARED."""
     found: dict[str, bytes] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix == ".npz":
@@ -309,7 +309,7 @@ def differing(one: Mapping[str, bytes], other: Mapping[str, bytes]) -> list[str]
 
 
 def _done(path: Path) -> dict[tuple[str, int], dict[str, Any]]:
-    """Runs that were made before; a line that a stop cut off is left out."""
+    """Runs that were made before; an incomplete line is left out."""
     found = {}
     for line in path.read_text().splitlines() if path.exists() else ():
         try:

@@ -1,12 +1,12 @@
-"""One commanded log alone: how often does the search raise an alarm where nothing is hidden, and name what is?
+"""A single commanded log: how often is there a false alarm, and how often is a hidden effect named?
 
     python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--out DIR] [--runs DIR]
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
-its torques too, searched by stretches of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
-Hidden effects are 3 and 10 times their minimum effect size, of the library in general or of what is wrong with a set-up
-(`--hidden setup`).  One small JSON a case under RUNS: the run can be stopped
-and goes on where it was, and the same command started twice shares the cases.
+its torques too, searched in windows of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
+Hidden effects are 3 and 10 times their minimum effect size.  They are effects of the library, or errors of a set-up
+(`--hidden setup`).  One JSON file per case is written under RUNS.  A stopped run can be continued, and several
+processes can share the cases.
 """
 
 from __future__ import annotations
@@ -111,23 +111,23 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """One case of each kind on the hinge; its numbers are not for keeping."""
+    """One case of each kind on the hinge; its numbers are not to be reported."""
     null: int = 50
-    """Cases with nothing hidden of each scene and set of channels."""
+    """Cases without a hidden effect, for each scene and set of channels."""
     blind: int = 60
-    """Cases with something hidden, over all of them."""
+    """Cases with a hidden effect, over all scenes and sets of channels."""
     hidden: Literal["library", "setup"] = "library"
     """What is hidden: effects of the library in general, or errors of the set-up, whose result is setup_errors.json."""
     only: str = ""
-    """Cases whose name begins so; the others are left for another process."""
+    """Run only cases whose name begins with this text."""
     windows: float = 0.0
-    """s, of windows that are replayed each from its own measured state; 0: motions are replayed whole."""
+    """Length of the windows, s, each replayed from its measured state; 0: whole motions are replayed."""
     minutes: float = 0.0
-    """No case is begun after so many; 0: all are made."""
+    """No case is begun after this time; 0: all are run."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     runs: Path | None = None
     """Folder of the cases; default: runs/lone_logs, of --quick below OUT."""
     out: Path = ROOT / "benchmarks" / "results"
@@ -136,7 +136,7 @@ class Arguments:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A scene with a set of channels: what all its cases share, compiled programs among it."""
+    """A scene with a set of channels; its cases share compiled programs."""
 
     name: str
     scene: Scene
@@ -197,7 +197,7 @@ def _waves(clock: np.ndarray) -> np.ndarray:
 
 
 def plans(arguments: Arguments) -> list[Plan]:
-    """All cases, in turns, so that a run that is stopped has some of every kind."""
+    """All cases, ordered so that a stopped run has some of every kind."""
     null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
             for n in range(1 if arguments.quick else arguments.null) for scene, channels in COMBINATIONS]  # fmt: skip
     hidden = list[Plan]()
@@ -222,7 +222,7 @@ def plans(arguments: Arguments) -> list[Plan]:
 
 
 def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | None, dict[str, float]]:
-    """One log of a robot that is drawn around the priors, what is hidden in it, and its true parameters."""
+    """One log of a robot that is drawn around the priors, its hidden effect and its true parameters."""
     rng, base = np.random.default_rng(seed), bench.base
     values = rng.normal(base.mean, np.where(base.nuisance, 1.0, 0.5) * base.std)
     truth = dict(zip(base.names, np.clip(values, base.low, base.high).tolist(), strict=True))
@@ -244,7 +244,7 @@ def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | 
 
 
 def _minimum(bench: Bench, kind: str, joint: str) -> float:
-    """Minimum effect size of what the library calls a hidden effect."""
+    """Minimum effect size of the library's effect that corresponds to a hidden one."""
     called = LIBRARY[kind]
     called = ON_HINGE.get(called, called) if joint == DOOR else called
     return next(e.minimum_size for e in bench.effects if e.name == called)
@@ -258,7 +258,7 @@ def configured(channels: tuple[str, ...], windows: float) -> DiscrepancyConfig:
 
 
 def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str, Any]:
-    """The result of one case; what fails is a result too."""
+    """The result of one case; a failure is a result too."""
     began = time.monotonic()
     result: dict[str, Any] = {**asdict(plan), "seed": seed, "code": CODE.get("git")}
     try:
@@ -305,7 +305,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
 
 
 def _judged(bench: Bench, hidden: Applied | None, result: dict[str, Any]) -> dict[str, Any]:
-    """What of an answer is right where something is hidden."""
+    """Which parts of an answer are right where an effect is hidden."""
     if hidden is None:
         return {}
     names, beside = [list(right(bench.scene, hidden))], [list(parts(bench.scene, hidden))]
@@ -320,7 +320,7 @@ def _best(found: ScoreTest) -> list[ScoreDirection]:
 
 
 def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Rates with Wilson's 95 % intervals.  Cases that failed are counted, and are no alarm and no name."""
+    """Rates with Wilson's 95 % intervals; failed cases are counted as neither an alarm nor a named effect."""
     null, blind = [c for c in cases if not c["effect"]], [c for c in cases if c["effect"]]
     silent = ("none", "error", "fit not converged")
     return {
@@ -341,7 +341,7 @@ def summary(cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(arguments: Arguments) -> None:
-    """Make the cases that are not there, and sum up those that are."""
+    """Run the missing cases, and summarise all."""
     began, benches = time.monotonic(), dict[tuple[str, str], Bench]()
     folder = arguments.runs or (arguments.out if arguments.quick else ROOT / "runs") / "lone_logs"
     runs = folder / ("quick" if arguments.quick else f"seed{arguments.seed}")

@@ -1,10 +1,10 @@
-"""Does the program work with another MuJoCo, and which of its numbers are others there?
+"""Does the program work with MuJoCo 4, and which numbers differ?
 
     python benchmarks/mujoco4.py --python PATH/TO/VENV/bin/python
 
 The venv holds this package with MuJoCo 4; this script itself runs with MuJoCo 3.17.  It runs the quick tests of model,
-replay and identification there (`passed`, `failed`), and computes the same numbers with both (`differences`): arrays
-of compiled models, plain C rollouts and replays in MJX.  What is done is kept in OUT/mujoco4_runs.
+replay and identification there (`passed`, `failed`), and compares numbers of both versions (`differences`): arrays of
+compiled models, plain C rollouts and replays in MJX.  Finished parts are kept in OUT/mujoco4_runs.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Mujoco4:
     tests: bool = True
     """Run the tests there."""
     minutes: float = 60.0
-    """After which no further group of test files is begun; those that were not run are named."""
+    """No group of test files is begun after this time; groups that were not run are listed."""
     processes: int = 1
-    """Of pytest."""
+    """Processes of pytest."""
     seed: int = 0
-    """Of the disturbed values."""
+    """Seed of the disturbed values."""
     out: Path = HERE / "results"
     """Folder for mujoco4.json."""
     quick: bool = False
@@ -127,7 +127,7 @@ def replayed_in_c(scene: Any, recording: Any) -> dict[str, np.ndarray]:
 
 
 def differences(three: Path, four: Path) -> dict[str, Any]:
-    """What is not the same number in two files of `compute`."""
+    """Numbers that differ between two files of `compute`."""
     one, two = np.load(three), np.load(four)
     out: dict[str, Any] = {"versions": [str(one["version"]), str(two["version"])], "numbers": {}}
     out["only_in_first"] = sorted({k.split("/", 1)[1] for k in {*one.files} - {*two.files}})
@@ -150,7 +150,7 @@ def groups(tests: Mapping[str, int]) -> dict[str, list[str]]:
 
 
 def tested(python: Path, processes: int, asked: Mapping[str, list[str]], runs: Path, minutes: float) -> dict[str, Any]:
-    """How many tests pass with an interpreter, and which fail; reports that are there already are read."""
+    """Number of tests that pass with an interpreter, and those that fail; existing reports are read."""
     cases: list[ElementTree.Element] = []
     end, left = time.monotonic() + 60.0 * minutes, list[str]()
     for name, files in asked.items():

@@ -1,4 +1,4 @@
-"""A fitted result in plain C MuJoCo, in a process that cannot import jax: what `neutral_result.py` and its test run.
+"""Replays a fitted result in plain C MuJoCo without jax, for `neutral_result.py` and its test.
 
     python benchmarks/neutral_replay.py FOLDER MJCF INPUT.npz OUTPUT.npz
 
@@ -21,7 +21,7 @@ BLOCKED = ("jax", "jaxlib", "droid_jax", "brax", "mujoco.mjx")
 
 
 class Block:
-    """Refuses to import what must not be needed."""
+    """Import hook that refuses modules which must not be needed."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> None:
         if name in BLOCKED or name.split(".")[0] in BLOCKED:

@@ -1,12 +1,11 @@
-"""A fitted result applied without jax against the program's own replay, on motions that were not fitted.
+"""Compares a fitted result, applied without jax, with the program's replay on motions that were not fitted.
 
     python benchmarks/neutral_result.py --fit door runs/all/gap --recording door runs/all/recordings/A.npz
 
 For each fit (a folder of `identify` or `gap`) it writes the neutral result, steps it in plain C MuJoCo in a process
 that cannot import jax (`neutral_replay.py`), and compares positions and motor torques with the replay in MJX.  The
-tolerance is what both engines differ by with the laws left out of both: with C in finer steps, and in the replay's own.
-It also draws from fitted.json and compares mean and covariance with the Gaussian's.  Cases that are not asked for stay
-in the file as they were.
+tolerance is the difference of both engines without the laws, with C at finer steps and at the replay's steps.  It also
+draws from fitted.json and compares mean and covariance with those of the Gaussian.  Other cases in the file are kept.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ class NeutralResult:
     fit: dict[str, Path] = field(default_factory=dict)
     """Folders of finished fits by name of the case."""
     recording: dict[str, Path] = field(default_factory=dict)
-    """A recording by name of the case that its fit did not see."""
+    """For each case by name, a recording that its fit did not see."""
     scene: dict[str, Path] = field(default_factory=dict)
-    """MJCF by name of the case, where it is not where the fit found it."""
+    """MJCF by name of the case, if it has moved since the fit."""
     xl330: Path | None = None
     """Folder of the logs of Rhoban/bam, for the case xl330, whose fit is experiments/results/real_xl330.json."""
     fine: int = 8
     """Steps of C in one of the replay's."""
     seed: int = 0
-    """Of the draws."""
+    """Seed of the draws."""
     out: Path = HERE / "results"
     """Folder for neutral_result.json."""
     quick: bool = False
@@ -61,7 +60,7 @@ def without_laws(effects: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def of_folder(fit: Path, recording: Path, scene: Path | None) -> tuple[Any, Any, Any, bool]:
-    """The fitted model of a folder, its Gaussian, a recording, and whether the fit did not see it."""
+    """The fitted model of a folder, its Gaussian, a recording, and whether the recording is held out."""
     from droid_jax.commands.fitted import load_fitted
     from droid_jax.recordings.formats import load_recording
 
@@ -70,9 +69,9 @@ def of_folder(fit: Path, recording: Path, scene: Path | None) -> tuple[Any, Any,
 
 
 def of_xl330(data: Path) -> tuple[Any, Any, Any, bool]:
-    """The same of the servo with load-dependent friction, by the values in experiments/results/real_xl330.json.
+    """The same for the servo with load-dependent friction, from values in experiments/results/real_xl330.json.
 
-    The Gaussian is that of the intervals there, without correlations.  The fit saw two gains, the log is of the third.
+    The Gaussian is made from the intervals there, without correlations.  Two gains were fitted; the log has the third.
     """
     sys.path.insert(0, str(EXPERIMENTS))
     from xl330_logs import xl330_log
@@ -150,7 +149,7 @@ def gaussian_of(fit: Path, fitted: Any) -> Any:
 
 
 def held_out(fit: Path, recording: Any, fitted: Any) -> bool:
-    """Whether the final model was not fitted to a recording; a search's test recording chose nothing either."""
+    """Whether a recording was neither fitted nor used to choose effects."""
     from droid_jax.commands.fitted import fitted_folder
 
     stage, folder = fitted_folder(fit)
@@ -160,7 +159,7 @@ def held_out(fit: Path, recording: Any, fitted: Any) -> bool:
 
 
 def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) -> tuple[Any, Any]:
-    """The drive, and the replay in MJX at the fitted values, which is kept in a folder: a program takes a minute."""
+    """The drive, and the replay in MJX at the fitted values, kept in a folder since compiling takes a minute."""
     import jax
     import jax.numpy as jnp
 
@@ -188,7 +187,7 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) 
 
 
 def without_observers(effects: tuple[Any, ...]) -> tuple[Any, ...]:
-    """What moves, and not what is read of it."""
+    """The drive without observation effects."""
     return tuple(replace(e, observe=None) for e in effects)
 
 

@@ -1,4 +1,4 @@
-"""mujoco.sysid beside this program: same recordings, same parameters, same start, same machine.
+"""Compares mujoco.sysid with this program: same recordings, parameters, start and machine.
 
     pip install -c constraints.txt -e ".[peers]"
     python benchmarks/peer_sysid.py [--quick] [--out DIR]
@@ -38,11 +38,11 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """Few iterations and short logs: shows that it runs, says nothing about quality."""
+    """Few iterations and short logs: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of peer_sysid.json and of the cases."""
     cases: tuple[str, ...] = ()
-    """Only these; all unless given."""
+    """Only these cases; default: all."""
 
 
 def cases(quick: bool) -> dict[str, Case]:

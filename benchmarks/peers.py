@@ -1,17 +1,17 @@
-"""This program beside mujoco.sysid and CMA-ES over plain C: the same data, parameters and bounds, on one machine.
+"""Compares this program with mujoco.sysid and CMA-ES in plain C: same data, parameters, bounds and machine.
 
     pip install -c constraints.txt -e ".[peers]"
     python benchmarks/peers.py [--data DIR] [--problems spring arm door ...] [--quick] [--out DIR]
 
-spring, arm: the models of mujoco.sysid's own tests, with data at 0.01 ms, judged on another motion.  door: Table I's
-with one spring, of the synthetic robot, 43 parameters, judged on repeats that no program saw.  go2, xl330, so101: real
-logs of positions (DIR holds the folders go2_leg, bam_xl330 and so101 of the data), judged on logs that were not fitted;
-no effect of the library is in these fits.
+spring, arm: the models of mujoco.sysid's own tests, with data at 0.01 ms, tested on another motion.  door: Table I's
+with one spring, of the synthetic robot, 43 parameters, tested on held-out repeats.  go2, xl330, so101: real logs of
+positions (DIR holds the folders go2_leg, bam_xl330 and so101 of the data), tested on logs that were not fitted, without
+effects of the library.
 
-Every fit is a process of its own, and the programs take turns.  `seconds` holds the start of the process,
-`fit_seconds` does not; mujoco.sysid's own models are fitted without importing anything of this program.  The judge is
-plain C MuJoCo: the door at half a millisecond, all else with the steps that a program fits with.  A program that has
-run is not run again.
+Every fit is a separate process, and the programs run in turn.  `seconds` includes the start of the process,
+`fit_seconds` does not.  mujoco.sysid's own models are fitted without importing this program.  The held-out error is
+computed in plain C MuJoCo: of the door at half a millisecond, of all others at the steps of each program's fit.  A
+program that has run is not run again.
 """
 
 from __future__ import annotations
@@ -65,16 +65,16 @@ class Arguments:
     data: Path | None = None
     """Folder with bam_xl330, go2_leg and so101; without it the real logs are left out."""
     problems: tuple[str, ...] = ()
-    """Only these; all that there are data for unless given."""
+    """Only these problems; default: all with data."""
     quick: bool = False
-    """The spring, and two seconds of the leg where there are data; numbers that are not for keeping."""
+    """The spring, and two seconds of the leg if its data exist; its numbers are not to be reported."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of peers.json, and of the runs."""
 
 
 @dataclass(frozen=True)
 class Logs:
-    """What is fitted and what judges, with what a program is given."""
+    """Recordings to fit, test recordings, and the further input of the programs."""
 
     fit: list[Recording]
     judge: list[Recording]
@@ -123,7 +123,7 @@ def real_logs(name: str, data: Path, quick: bool) -> Logs:
 
 
 def door_logs() -> Logs:
-    """Table I's door with one spring: all but the last repeats of demonstrations A and C; those judge."""
+    """Table I's door with one spring; the last repeats of demonstrations A and C are the test data."""
     scene = door_scene(timestep=doors.OURS)
     fit, judge = zip(*(split_repeats(r, 0.3) for r in recordings(scene, synthetic_truth(scene, 1, 1), "AC", 1)),
                      strict=True)  # fmt: skip
@@ -132,7 +132,7 @@ def door_logs() -> Logs:
 
 
 def prepared(name: str, arguments: Arguments, folder: Path) -> None:
-    """The problem's folder: what every program reads."""
+    """Folder of a problem, with the input of every program."""
     if (folder / PROBLEM).is_file():
         return
     if name in REAL:
@@ -156,7 +156,7 @@ def prepared(name: str, arguments: Arguments, folder: Path) -> None:
 
 
 def fitted(name: str, program: str, folder: Path) -> dict[str, Any]:
-    """What a program found, with the seconds of its process."""
+    """Result of a program, with the seconds of its process."""
     path, alone = folder / f"{program}.json", name in sysid_models.PARAMETERS and program == "sysid"
     if not path.is_file() or "seconds" not in json.loads(path.read_text()):
         module = "sysid_models" if alone else "programs"
@@ -169,8 +169,9 @@ def fitted(name: str, program: str, folder: Path) -> dict[str, Any]:
 
 
 def heldout(name: str, folder: Path, found: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """Error of each program on what judges: mean absolute error of position, or of the door's torques as in equation 1,
-    N m, where "truth" has what noise leaves."""
+    """Error of each program on the test data: mean absolute position error, or for the door equation 1 in N m.
+
+    "truth" is the error of the true parameters, which is due to noise."""
     task = problem(folder, "ours")
     judge = [load_recording(folder / f"{file}.npz") for file in task.asked["judge"]]
     values = {program: np.asarray(one["values"]) for program, one in found.items()}
@@ -216,7 +217,7 @@ def _inside(folder: Path, one: dict[str, Any]) -> list[int]:
 
 
 def main(arguments: Arguments) -> None:
-    """All programs on all problems; those that an earlier run left in peers.json stay in it."""
+    """All programs on all problems; other problems in peers.json are kept."""
     every = (*SYNTHETIC, *REAL)
     if unknown := [p for p in arguments.problems if p not in every]:
         raise SystemExit(f"error: no problem {', '.join(unknown)}; there are {', '.join(every)}")

@@ -1,13 +1,12 @@
-"""Is what a quick rehearsal predicts what complete ones find?
+"""Do the predictions of a quick rehearsal agree with complete rehearsals?
 
     python benchmarks/rehearse.py [--quick] [--scenes hinge ...] [--minutes 60] [--out DIR] [--runs DIR]
 
 The lone hinge, an arm of two links beside a driven door, and the built-in door.  Each effect that has a place in the
-scene, and of which the synthetic robot has a law of its own, is hidden at the size that the quick form predicts; while
-it is found at smaller ones, while it is not at larger ones, of a ladder from 0.5 to 2 times that size.  What an earlier
-run found at sizes of its own counts too, and is not made again.  Every log is
-fitted and searched (`droid_jax.rehearsal.full`).  One folder a case under RUNS: the run can be stopped and goes on
-where it was.
+scene, and for which the synthetic robot has a separate law, is hidden at the size that the quick form predicts.  While
+it is found, smaller sizes follow, otherwise larger ones, in steps from 0.5 to 2 times that size.  Results of earlier
+runs at other sizes are used too.  Every log is fitted and searched (`droid_jax.rehearsal.full`).  Each case has a
+folder under RUNS, so that a stopped run can be continued.
 """
 
 from __future__ import annotations
@@ -64,19 +63,19 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """One effect of the hinge at one size; its numbers are not for keeping."""
+    """One effect of the hinge at one size; its numbers are not to be reported."""
     scenes: tuple[str, ...] = SCENES
-    """To make cases in; the others are summed up, if any are there."""
+    """Scenes in which cases are run; existing cases of the others are summarised."""
     seeds: int = SEEDS
-    """Cases of each effect at each size that is tried; it counts as found there if it is in all of them."""
+    """Cases of each effect at each tried size; the effect counts as found if it is found in all of them."""
     minutes: float = 0.0
-    """No case is begun after so many; 0: all are made."""
+    """No case is begun after this time; 0: all are run."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     seed: int = 0
-    """Of all draws."""
+    """Seed of all draws."""
     earlier: tuple[Path, ...] = ()
-    """Folders of cases of earlier runs of the same search, whose sizes count."""
+    """Folders of cases of earlier runs of the same search, which are used too."""
     runs: Path | None = None
     """Folder of the cases; default: runs/rehearse, of --quick below OUT."""
     out: Path = ROOT / "benchmarks" / "results"
@@ -84,7 +83,7 @@ class Arguments:
 
 
 def measured(where: Setting, seed: int) -> list[Recording]:
-    """Two motions of a robot of which nothing is hidden: their commands, and how their repeats scatter."""
+    """Two motions of a robot without hidden effects: their commands and the scatter of their repeats."""
     truth = dict(zip(where.base.names, where.base.mean.tolist(), strict=True))
     config = SyntheticRobotConfig(repeats=REPEATS)
     out = []
@@ -109,7 +108,7 @@ def _recorded(
 
 
 def door_by_command(runs: Path) -> dict[str, Any]:
-    """What the quick form takes on the built-in door, as a user calls it: seconds, and seconds of both cores; kept."""
+    """Wall and CPU seconds of the quick form on the built-in door, as a command; kept."""
 
     def made() -> dict[str, Any]:
         out = runs / "door_command"
@@ -121,7 +120,7 @@ def door_by_command(runs: Path) -> dict[str, Any]:
 
 
 def rehearsal_of(name: str, runs: Path, seed: int, full: bool) -> tuple[dict[str, Any], Scene, FullRehearsal | None]:
-    """The quick rehearsal of a scene, kept, the scene, and what its complete ones share where any are made."""
+    """The quick rehearsal of a scene, kept; the scene; and the shared data of its complete rehearsals."""
     where = setting(name, runs / "door")
     recordings = measured(where, seed)
     effects = observable_effects(where.scene, recordings, channels=CHANNELS)
@@ -165,7 +164,7 @@ def asked(quick: Mapping[str, Any], scene: Scene) -> list[dict[str, Any]]:
 
 
 def next_step(steps: Mapping[float, bool]) -> float | None:
-    """The size to try next, where `steps` are known to be found or not; None where the smallest found one is known."""
+    """The size to try next, given the results at `steps`; None where the smallest found size is known."""
     rungs = list(LADDER)
     if not steps:
         return 1.0
@@ -184,7 +183,7 @@ def cases_at(scene: Scene, entry: Mapping[str, Any], index: int, times: float, s
 
 
 def kept_case(folder: Path, case: HiddenCase) -> dict[str, Any] | None:
-    """The result of a case, if it is there."""
+    """The result of a case, if it exists."""
     path = folder / case.name / "result.json"
     return json.loads(path.read_text()) if path.is_file() else None
 
@@ -227,9 +226,9 @@ def earlier_cases(folders: Sequence[Path], scene: str, entry: Mapping[str, Any])
 
 
 def measured_size(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> float | None:
-    """The smallest size found, over the predicted one; inf where none is; None where that is not known yet.
+    """Ratio of the smallest size found to the predicted one; inf where none is found; None where not known yet.
 
-    It is known where a smaller one was not found, or none was up to twice the predicted one.
+    It is known if a smaller size was not found, or if none was found up to twice the predicted size.
     """
     times = {round(c["size"] / entry["smallest"], 3) for c in cases}
     known = {t: all(c["found"] for c in cases if round(c["size"] / entry["smallest"], 3) == t) for t in times}
@@ -266,7 +265,7 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
 def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Shares over the effects whose smallest size is known.
 
-    Wrong advice, of what was surely found as it said: something hidden at that size or above was not.
+    Wrong advice: an effect predicted to be surely found was not found at that size or above.
     """
     done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
     every = [e for effects in by_scene.values() for e in effects if e["sure"]]
@@ -284,7 +283,7 @@ def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, An
 
 
 def main(arguments: Arguments) -> None:
-    """Make the cases that are not there, and sum up those that are."""
+    """Run the missing cases, and summarise all."""
     began = time.monotonic()
     runs = arguments.runs or (arguments.out if arguments.quick else ROOT / "runs") / "rehearse"
     runs = runs / ("quick" if arguments.quick else f"seed{arguments.seed}")

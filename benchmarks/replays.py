@@ -1,4 +1,4 @@
-"""The door's replay, ready to be timed: this program's, the C engine's, and mjx.step by itself.
+"""Replays of the door to be timed: this program's, the C engine's, and mjx.step alone.
 
 Each maker returns a function without arguments that computes one whole population and returns when
 its work is done.
@@ -35,7 +35,7 @@ Run = Callable[[], Any]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is replayed: scene, parameter space, command [T, U] on the clock, and the seed of the samples."""
+    """A replay to time: scene, parameter space, command [T, U] on the clock, and the seed of the samples."""
 
     scene: Scene
     space: Space
@@ -116,7 +116,7 @@ def _mjx_step(case: Case) -> Callable[[jax.Array], jax.Array]:
 
 
 def mjx_on_one_device(case: Case, population: int, options: dict[str, Any] | None = None) -> Run:
-    """mjx.step, vmapped and jitted as it comes or with compiler options, on one device."""
+    """mjx.step with vmap and jit, with or without compiler options, on one device."""
     batch = jax.jit(jax.vmap(_mjx_step(case)), compiler_options=options)
     values = np.float32(case.values(population))
     return lambda: jax.block_until_ready(batch(values))

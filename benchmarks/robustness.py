@@ -1,12 +1,12 @@
-"""Damaged files, damaged scenes and wrong arguments, by the thousand: is each refused in a sentence?
+"""Thousands of damaged files, damaged scenes and wrong arguments: is each refused with a clear message?
 
     python benchmarks/robustness.py [--quick] [--out DIR] [--only WORD ...]
 
 Mutations of every kind of file that the program reads back (tests/fuzz/run_kinds.py) and every public function with
-every wrong argument (tests/fuzz/api_calls.py), in worker processes that a watchdog ends.  An input is either accepted,
-and then what was read is of use, or refused by a ValueError or an OSError whose message is one line that names it.  A
-run that was stopped goes on; what was found lies in runs/robustness.  Kills of whole runs are benchmarks/kills.py's:
-their numbers are taken from its result, beside which this one is written.
+every wrong argument (tests/fuzz/api_calls.py), in worker processes that a watchdog ends.  An input must either be
+accepted, with usable content, or refused by a ValueError or an OSError whose message is one line that names it.  A
+stopped run can be continued; its results so far are in runs/robustness.  Numbers about kills of whole runs are read
+from the result of benchmarks/kills.py in the same folder.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Arguments:
     arguments: int = 4_000
     """Calls with wrong arguments."""
     seed: int = 0
-    """Of all mutations."""
+    """Seed of all mutations."""
     only: tuple[str, ...] = ()
     """Kinds whose name holds one of these words."""
     workers: int = WORKERS
@@ -124,7 +124,7 @@ def main(arguments: Arguments) -> None:
 
 
 def cases(arguments: Arguments) -> Iterator[Case]:
-    """Which cases there are, those of all kinds by turns."""
+    """All cases, alternating between kinds."""
     share = 100 if arguments.quick else 1
     tried = run_kinds.EVERY.values()
     whole = sum(kind.weight for kind in tried)
@@ -138,7 +138,7 @@ def cases(arguments: Arguments) -> Iterator[Case]:
 
 
 def kept(path: Path) -> dict[Case, Outcome]:
-    """What an earlier start of the same code found."""
+    """Results of an earlier run of the same code."""
     if not path.is_file():
         return {}
     lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("]")]
@@ -149,7 +149,7 @@ def kept(path: Path) -> dict[Case, Outcome]:
 
 
 class Worker:
-    """A process that judges one case after the other; started again where a case ended it."""
+    """A process that tests one case after the other; restarted where a case ended it."""
 
     def __init__(self, seed: int) -> None:
         self.seed, self.process = seed, None
@@ -172,7 +172,7 @@ class Worker:
             self.process = None
 
     def judged_twice(self, case: Case) -> Outcome:
-        """A case that took too long is tried once more: the machine may have been busy."""
+        """Test a case; one that took too long is tried once more, since the machine may have been busy."""
         outcome = self.judged(case)
         return self.judged(case) if outcome.result == "hang" else outcome
 
@@ -231,7 +231,7 @@ def resident(pid: int | None) -> int:
 
 
 def serve_cases(pipe: Connection, seed: int) -> None:
-    """Judges the cases that come through the pipe, in a folder of its own, with a bound on memory."""
+    """Test the cases that come through the pipe, in a separate folder, with a memory limit."""
     with tempfile.TemporaryDirectory(prefix="robustness-") as folder:
         os.chdir(folder)
         said = os.open("said.txt", os.O_WRONLY | os.O_CREAT)
@@ -277,7 +277,7 @@ class Bench:
                 call.run(**call.valid)
 
     def judged(self, name: str, number: int) -> Outcome:
-        """A case of a kind that was prepared."""
+        """Test a case of a prepared kind."""
         random = Random(f"{self.seed}/{name}/{number}")
         if name == ARGUMENTS:
             call, argument, wrong = random.choice(self.wrong)
@@ -286,11 +286,11 @@ class Bench:
         return kinds.attempt(kind, valid, self.folder / "input", random, most=self.most(name))
 
     def most(self, name: str) -> float:
-        """Seconds of processor time beyond which a case of a kind hangs: a page may take longer than a file."""
+        """Processor seconds above which a case of a kind counts as hanging; pages may take longer than files."""
         return max(MOST_SECONDS, SLOWER * self.seconds.get(name, 0.0))
 
     def prepare(self, name: str) -> None:
-        """Make a kind's valid example, where it is not there yet."""
+        """Make a kind's valid example, where it does not exist yet."""
         if name != ARGUMENTS and name not in self.valid:
             self.valid[name] = self._made(run_kinds.EVERY[name])
 
@@ -343,7 +343,7 @@ def summary(found: dict[Case, Outcome]) -> dict[str, Any]:
 
 
 def kills(out: Path) -> dict[str, Any]:
-    """How many killed runs resumed to the same result, of kills.json; null where there is none."""
+    """Number of killed runs that resumed to the same result, from kills.json; None where there is no file."""
     path = out / "kills.json"
     found = json.loads(path.read_text()) if path.is_file() else {}
     keys = ("kills", "kills_resumed_identical", "kills_resumed_to_an_end")

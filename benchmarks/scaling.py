@@ -1,12 +1,12 @@
-"""What a batch costs and holds in memory, against population, recordings, length, joints and number of effects.
+"""Time and memory of a batch of replays against population, recordings, length, joints and number of effects.
 
     python benchmarks/scaling.py [--quick] [--out DIR] [--only AXIS ...]
 
-Along each axis one thing varies and the rest stays at its base: 128 samples, one recording, the whole demonstration A
-of the built-in door at a 4 ms step, no effect.  Along "joints" a chain of servo-driven joints takes the door's place.
-Every point is a process of its own with an empty compilation cache: s of the first call, which compiles, median s of
-later ones, and the most memory that the process held, both with all that Python and jax take.  Writes DIR/scaling.json
-after every point and DIR/scaling.png at the end.
+Along each axis one quantity varies from the base case: 128 samples, one recording, the whole demonstration A of the
+built-in door at a 4 ms step, no effect.  Along "joints" a chain of servo-driven joints replaces the door.  Every point
+is a separate process with an empty compilation cache.  It measures the seconds of the first call, which compiles, the
+median seconds of later calls, and the peak memory of the whole process.  Writes DIR/scaling.json after every point and
+DIR/scaling.png at the end.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Arguments:
     repeats: int = 3
     """Timed calls of a point."""
     point: str = ""
-    """JSON of one point, measured in this process: how the script calls itself."""
+    """JSON of one point, measured in this process; used by the script itself."""
 
     def __post_init__(self) -> None:
         if unknown := [axis for axis in self.only if axis not in AXES]:
@@ -207,7 +207,7 @@ def main() -> None:
             how = found.get("error") or f"{found['seconds']:.3f} s, {found['gib']:.2f} GiB"
             print(f"{axis} {value:g}: {how}", flush=True)
             write_json(path, {"quick": arguments.quick, "timestep": TIMESTEP, "points": points}, indent=2)
-    source = origin(0)  # only now: the points had the accelerator for themselves
+    source = origin(0)  # imported only now, so that the points had the accelerator's memory
     write_json(path, {**source, "quick": arguments.quick, "timestep": TIMESTEP, "points": points}, indent=2)
     write_bytes(path.with_suffix(".png"), png_bytes(figure(points)))
     failed = [f"{p['axis']} {p[p['axis']]:g}: {p['error']}" for p in points if "error" in p]

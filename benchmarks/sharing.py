@@ -1,4 +1,4 @@
-"""Work that can be stopped and that several processes share: what one of them made, or makes, no other makes too."""
+"""Results that several processes share: each is made by one process only, also after a stop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNCOMMITTED = "-dirty"  # what `runtime.versions` puts behind a commit that is n
 
 
 def kept(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
-    """The JSON that lies at `path`, made first where there is none; another process that is making it is waited for."""
+    """The JSON at `path`, made first where it does not exist; waits for another process that is making it."""
     if not path.is_file():
         with claimed(path, wait=True):
             if not path.is_file():  # which another process may have made meanwhile
@@ -26,16 +26,16 @@ def kept(path: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def code_name(commit: str | None) -> str:
-    """A name for what code of a commit leaves half done; of uncommitted code one that no later start has."""
+    """Name for unfinished work of a commit's code; uncommitted code gets a name that no later start has."""
     return commit if commit and not commit.endswith(UNCOMMITTED) else f"{commit}_{time.time_ns()}_{os.getpid()}"
 
 
 @contextlib.contextmanager
 def claimed(path: Path, *, wait: bool) -> Iterator[bool]:
-    """Whether this process alone may make what lies at `path`, until the end of the block.
+    """Whether this process alone may make the file at `path`, until the end of the block.
 
-    wait: for a process that is making it, instead of False at once.  The claim is a lock on `path`.lock, which ends
-    with the process however it ends.
+    wait: wait for a process that is making it, instead of returning False.  The claim is a lock on `path`.lock, which
+    is released when the process ends, however it ends.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.with_name(f"{path.name}.lock").open("w") as held:

@@ -1,10 +1,10 @@
-"""Where the default command's time goes, stage by stage: compiling, replaying, training, and all else.
+"""Time of the default command by stage: compiling, replaying, training, and the rest.
 
     python benchmarks/stage_profile.py [--warm] [--quick] [--out DIR]
 
-Runs `python -m droid_jax.run` in this process, with an empty compilation cache unless --warm.  jax says how long it
-traces, lowers and compiles; what remains of a batch of replays, or of a call of brax's PPO, is their own.  The rest of
-a stage is the host: recordings, statistics, pictures, files.
+Runs `python -m droid_jax.run` in this process, with an empty compilation cache unless --warm.  jax reports how long
+it traces, lowers and compiles; the remaining time of a batch of replays, or of a call of brax's PPO, is counted as
+computing.  The rest of a stage is work of the host: recordings, statistics, pictures, files.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Arguments:
 class Times:
     """Seconds by stage and kind.
 
-    A kind that runs within another one is not counted in that one.
+    Time of a kind that runs within another kind is not counted in the other.
     """
 
     stage: str = "start"
@@ -65,7 +65,7 @@ class Times:
     _ended: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
 
     def add(self, kind: str, seconds: float) -> None:
-        """So many seconds of a kind, which end now; what ended within them was counted."""
+        """Add seconds of a kind, which end now, without time inside them that was already counted."""
         began, inside = time.perf_counter() - seconds, 0.0
         while self._ended and self._ended[-1][0] >= began:
             inside += self._ended.pop()[1]
@@ -74,7 +74,7 @@ class Times:
         self._within[-1] += seconds - inside
 
     def timed(self, kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, whose own time is counted."""
+        """The function, with its time counted as a kind."""
 
         def call(*arguments: Any, **named: Any) -> Any:
             began = time.perf_counter()
@@ -89,7 +89,7 @@ class Times:
         return call
 
     def staged(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function as a stage of its own, whose rest is the host's."""
+        """The function as a stage, the rest of whose time is the host's."""
         whole = self.timed("host", function)
 
         def call(*arguments: Any, **named: Any) -> Any:
@@ -103,7 +103,7 @@ class Times:
 
 
 def profiled(arguments: list[str]) -> Times:
-    """What a command of the program spends its time on."""
+    """Seconds of a command by stage and kind."""
     import jax
     from brax.training.agents.ppo import train as ppo
 

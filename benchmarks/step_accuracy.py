@@ -1,4 +1,4 @@
-"""How far a replay's time step is from the continuous door: torques against plain C MuJoCo at 0.1 ms.
+"""Discretisation error of the door's replay: torques against plain C MuJoCo at 0.1 ms.
 
     python benchmarks/step_accuracy.py [--quick] [--out DIR]
 

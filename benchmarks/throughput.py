@@ -1,4 +1,4 @@
-"""Physics steps per second of the door's replay: this program, the C engine, and MJX as it comes.
+"""Physics steps per second of the door's replay: this program, the C engine, and MJX with default settings.
 
     python benchmarks/throughput.py                # everything; 20 to 40 minutes on two cores
     python benchmarks/throughput.py --quick        # does it all work?  about two minutes
@@ -53,8 +53,8 @@ class Throughput:
     steps: steps of 2 ms, from the start; default the whole demonstration.
     repeats: timed runs of each, after one that compiles; the median counts.
     seed: of the random samples.
-    untuned: measure MJX as it comes; auto is yes unless quick.
-    timeout: s that each process of its own (MJX as it comes, memory) may take.
+    untuned: measure MJX with default settings; auto is yes unless quick.
+    timeout: s that each separate process (MJX with default settings, memory) may take.
     part: all; the others are started by it in processes of their own.
     """
 
@@ -113,7 +113,7 @@ def time_rows(
 
 
 def untuned_part(config: Throughput) -> dict[str, Any]:
-    """MJX as it comes, for a process in which nothing was tuned."""
+    """MJX with default settings, for a process in which `tune` was not called."""
     with runtime.quiet():
         import replays
 
@@ -135,7 +135,7 @@ def memory_part(config: Throughput) -> dict[str, Any]:
 
 
 def tune() -> None:
-    """Tune jax as the program does, but compile everything anew: compile times are a result."""
+    """Tune jax as the program does, but without a compilation cache, since compile times are a result."""
     runtime.tune()
     import jax
 
@@ -185,9 +185,9 @@ def alternate(case: Any, populations: Sequence[int], repeats: int, progress: Pro
 
 
 def agreement(case: Any) -> dict[str, float]:
-    """Do both engines compute the same?  Median over samples of the RMS torque difference, N m.
+    """Difference of both engines: median over samples of the RMS torque difference, N m.
 
-    The replay is second order in the time step and C is first order, so it is small, not zero.
+    It is small but not zero, because the replay is of second order in the time step and C of first order.
     finite: share of the MJX samples without NaN or infinity.
     """
     import replays

@@ -1,4 +1,4 @@
-"""How long a fit takes on this machine, compilation included: the paper's size, and the command's quick preset.
+"""Time of a fit on this machine with compilation: of the paper's size, and of the command's quick preset.
 
     python benchmarks/time_to_fit.py [--quick] [--out DIR]
 
@@ -38,7 +38,7 @@ class Arguments:
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of time_to_fit.json."""
     part: str = "all"
-    """all, or fit: started by it in a process of its own."""
+    """all; fit is used by the script itself, in a separate process."""
 
 
 def fit(generations: int, most: float | None = None) -> dict[str, Any]:

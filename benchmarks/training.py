@@ -1,12 +1,11 @@
-"""How fast a policy is trained on this machine: actions and simulation steps per second, time to 95 % success.
+"""Speed of policy training on this machine: actions and simulation steps per second, time to 95 % success.
 
     python benchmarks/training.py [--quick] [--out DIR] [--preset quick] [--seed 0]
 
 One policy on doors drawn from the prior, on all devices, from an empty compilation cache; then it is tried in the
-simulation and on the synthetic robot (Table I's door without a spring).  Writes DIR/training.json, by preset and
-device:
-what the file holds of others stays.  The policy and the Gaussian of its doors are left in DIR/training_policy/PRESET
-(PRESET_gpu of a GPU), where experiments/policy_parity.py can take them.
+simulation and on the synthetic robot (Table I's door without a spring).  Writes DIR/training.json by preset
+and device; other entries of the file are kept.  The policy and the Gaussian of its doors are written to
+DIR/training_policy/PRESET (PRESET_gpu on a GPU), for experiments/policy_parity.py.
 """
 
 from __future__ import annotations
@@ -61,19 +60,19 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """A few actions: shows that it runs, says nothing about quality."""
+    """A few actions: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of training.json."""
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """Of training."""
+    """Preset of the training."""
     seed: int = 0
-    """Of the policy."""
+    """Seed of the policy."""
     trials: int = 100
     """Episodes in simulation, and trials on the synthetic robot."""
 
 
 def measured(arguments: Arguments) -> dict[str, Any]:
-    """One training and what came of it; the policy is saved."""
+    """One training and its results; the policy is saved."""
     often = PRESETS[arguments.preset].evaluations  # the preset as it is
     asked = Options(quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=often)
     budget = asked.budget

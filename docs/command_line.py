@@ -62,7 +62,8 @@ def _row(field: dataclasses.Field[Any], hint: Any, meaning: str) -> str:
     """A field as a row of the table."""
     annotated = typing.get_origin(hint) is typing.Annotated
     values = _values(typing.get_args(hint)[0] if annotated else hint)
-    name = field.name.replace("_", "-")
+    renamed = (getattr(each, "name", None) for each in hint.__metadata__) if annotated else ()
+    name = next(filter(None, renamed), field.name.replace("_", "-"))
     if annotated and tyro.conf.Positional in hint.__metadata__:
         option = name.upper() + " ..." * values.endswith("...")
     else:

@@ -5,9 +5,9 @@
     droid_jax.tune()
     scene = droid_jax.load_scene("my_robot.xml")
 
-Each public name is loaded when it is first asked for (PEP 562): importing the package starts neither
-jax nor mujoco, so `tune` can come first, and asking for the cost loads neither evosax nor brax.
-docs/your-robot.md shows the names at work.
+Each public name is loaded when it is first used (PEP 562).  Importing the package therefore starts neither jax nor
+mujoco, so that `tune` can be called first, and using the cost loads neither evosax nor brax.  docs/your-robot.md shows
+examples.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, loaded now and kept; AttributeError lists them for an unknown one."""
+    """A public name, loaded and stored on first use; AttributeError with all public names for an unknown one."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public: {', '.join(__all__)}")
     found = _load(*_HOMES[name])
@@ -114,7 +114,7 @@ def __dir__() -> list[str]:
 
 
 def _load(module: str, name: str) -> Any:
-    """A name out of a module of this package."""
+    """A name from a module of this package."""
     from droid_jax.quiet import quiet
 
     with quiet():

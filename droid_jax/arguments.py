@@ -1,7 +1,7 @@
-"""Checks of numbers, names and texts, the same for a file's content and for a Python argument.
+"""Checks of numbers, names and texts, from files and from Python arguments.
 
-Every function returns what it was given, in the type that it promises, or raises a ValueError of one sentence that
-begins with `what`: the argument, or the file and the place in it.
+Every function returns its argument, converted to the promised type, or raises a ValueError of one sentence.  The
+sentence begins with `what`: the argument, or the file and the place in it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 LONGEST_NAME = 200  # characters of a name; of a name that becomes a file's, bytes in UTF-8 (file systems allow 255)
 LONGEST_PATH = 4096  # characters, as Linux allows bytes
 LONGEST_NOTE = 10_000  # characters of a free text
-# Control characters, half surrogate pairs, line separators, and what turns the direction of the text behind it: no file
-# name, figure or page can hold all of them.
+# Control characters, half surrogate pairs, line separators, and characters that change the direction of text.  File
+# names, figures and pages cannot hold all of them.
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028-\u202e\u2066-\u2069]")
 _UNPRINTABLE_NOTE = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
@@ -43,7 +43,7 @@ def shown(value: Any, longest: int = 80) -> str:
 
 
 def said(error: BaseException, longest: int = 300) -> str:
-    """What another library's error says, in one line that can be printed, cut where it is long: for messages."""
+    """Message of another library's error in one printable line, cut where it is long."""
     text = _UNPRINTABLE.sub("?", " ".join(str(error).split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
@@ -52,7 +52,7 @@ def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> s
     """A name: text without control characters, of at most LONGEST_NAME characters.
 
     Args:
-        value: what should be one.
+        value: the name to check.
         what: begins the message, e.g. "recording 'a', phase 2, name".
         file: whether it becomes the name of a file: no path separator, no dot in front.
         empty: whether "" is a name.
@@ -72,7 +72,7 @@ def name(value: Any, what: str, *, file: bool = False, empty: bool = False) -> s
 
 
 def names(value: Any, what: str, *, empty: bool = True) -> tuple[str, ...]:
-    """Several names, none of them twice; one text is no list of its letters."""
+    """Several names, none of them twice; a single text is refused."""
     if not is_list(value):
         raise ValueError(f"{what} must be a list of names, got {shown(value)}")
     out = tuple(name(one, f"{what}, entry {i}") for i, one in enumerate(value, 1))
@@ -119,7 +119,7 @@ def number(
     most: float | None = None,
     infinite: bool = False,
 ) -> float:
-    """A finite number; true and false are none, nor is text that looks like one.
+    """A finite number; booleans and texts are refused.
 
     Args:
         value: a Python or numpy number.
@@ -140,7 +140,7 @@ def number(
 
 
 def numeric(value: Any, what: str) -> np.ndarray:
-    """Numbers as a float64 array, NaN and infinities among them; text is none, lists of unequal length are none."""
+    """Numbers as a float64 array, possibly NaN or infinite; texts and lists of unequal length are refused."""
     import numpy as np
 
     try:
@@ -153,7 +153,7 @@ def numeric(value: Any, what: str) -> np.ndarray:
 
 
 def whole(value: Any, what: str, *, least: int | None = None, most: int | None = None) -> int:
-    """A whole number as an int; 2.0 is none."""
+    """A whole number as an int; 2.0 is refused."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise ValueError(f"{what} must be a whole number, got {shown(value)}")
     out = int(value)
@@ -179,7 +179,7 @@ def _check_range(
 
 
 def flag(value: Any, what: str) -> bool:
-    """True or False, of Python or numpy; other values are no answers to a question."""
+    """True or False, of Python or numpy; other values are refused."""
     if isinstance(value, bool):
         return value
     if type(value).__name__ in ("bool", "bool_") and type(value).__module__ == "numpy":
@@ -212,7 +212,7 @@ def instance(value: Any, what: str, kind: type[Kind]) -> Kind:
 
 
 def mapping(value: Any, what: str) -> Mapping[Any, Any]:
-    """A dictionary or another mapping; what its keys and values are is for others to check."""
+    """A dictionary or another mapping; its keys and values are not checked."""
     return instance(value, what, Mapping)
 
 
@@ -227,7 +227,7 @@ def instances(value: Any, what: str, kind: type[Kind], *, empty: bool = True) ->
 
 
 def path_of(value: Any, what: str) -> Path:
-    """A path, given as one or as text."""
+    """A path, given as a Path or as text."""
     if not isinstance(value, (str, PathLike)) or len(str(value)) > LONGEST_PATH:
         raise ValueError(f"{what} must be text or a Path, got {shown(value)}")
     printable(str(value), what)
@@ -275,7 +275,7 @@ def check_fields(of: Any, **checks: Callable[[Any, str], Any]) -> None:
 
 
 def set_field(of: Any, field: str, value: Any) -> None:
-    """Put what a check made of an argument into a frozen dataclass, in its __post_init__."""
+    """Store a checked value in a field of a frozen dataclass, in its __post_init__."""
     object.__setattr__(of, field, value)
 
 
@@ -284,6 +284,6 @@ def _article(word: str) -> str:
 
 
 def _got(value: Any) -> str:
-    """What a value is: its text where it is short data, else its type."""
+    """A value for a message: its text where it is short data, else its type."""
     plain = value is None or isinstance(value, (str, bytes, int, float))
     return shown(value) if plain else _article(type(value).__name__)

@@ -1,17 +1,17 @@
-"""The program as a shell sees it: its streams, what stops it, and the exit code that says so.
+"""The program as a shell command: its streams, signals and exit codes.
 
 | code | the run |
 |---|---|
 | 0 | is done |
-| 1 | failed for want of something else than good input: a full disk, an output that cannot be written |
+| 1 | failed, but not because of its input: a full disk, an output that cannot be written |
 | 2 | was given bad input, or a place that cannot be written |
 | 130, 143 | was interrupted (Ctrl-C), terminated |
-| 141 | had more to say, and nobody reads it any more: `| head` |
+| 141 | had more output, but the reader is gone: `| head` |
 
-A signal ends the program at once, without an exception on its way through other programs' code, which may swallow it:
-all files are whole at any time.  What must be tidied up before is told to `at_the_end`.
+A signal ends the program at once, without an exception, which other libraries' code might swallow.  All files are
+complete at any time.  Actions that are needed before the end are registered with `at_the_end`.
 
-Light, and imported before everything else: a stop in the first second ends as one in the first hour.
+The module imports little and is imported first, so that a stop in the first second is handled as any later one.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-GRACE = 1.0  # s: Python's handlers wait for a compiler of minutes to return, another thread does not
+GRACE = 1.0  # s until another thread ends the program: Python's handler may wait minutes for a compiler to return
 CLOSED = 128 + signal.SIGPIPE
 _tidying: list[Callable[[], object]] = []
 _going_on: list[Callable[[], str]] = []
 
 
 def program() -> int:
-    """The command line as a program of its own: its exit code."""
+    """Run the command line as a program; returns its exit code."""
     _open_streams()
     _watch_signals()
     try:
@@ -46,7 +46,7 @@ def program() -> int:
 
 @contextlib.contextmanager
 def at_the_end(tidy: Callable[[], object]) -> Iterator[None]:
-    """Where a signal ends the program inside the block, `tidy` is called before; otherwise nothing happens."""
+    """Calls `tidy` before the program ends, if a signal ends it inside the block."""
     _tidying.append(tidy)
     try:
         yield
@@ -55,8 +55,8 @@ def at_the_end(tidy: Callable[[], object]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def last_words(going_on: Callable[[], str]) -> Iterator[None]:
-    """Inside the block, what `words` says behind "interrupted"."""
+def stop_advice(going_on: Callable[[], str]) -> Iterator[None]:
+    """Inside the block, `stop_message` ends with the text of `going_on`, which says how to continue the run."""
     _going_on.append(going_on)
     try:
         yield
@@ -64,12 +64,12 @@ def last_words(going_on: Callable[[], str]) -> Iterator[None]:
         _going_on.remove(going_on)
 
 
-def words(number: int) -> str:
-    """What the program says when a signal ends it."""
-    return ("terminated" if number == signal.SIGTERM else "interrupted") + "".join(told() for told in _going_on[-1:])
+def stop_message(number: int) -> str:
+    """The message when signal `number` ends the program."""
+    return ("terminated" if number == signal.SIGTERM else "interrupted") + "".join(text() for text in _going_on[-1:])
 
 
-def nobody_reads() -> bool:
+def reader_gone() -> bool:
     """Whether the standard output is a pipe whose reader is gone."""
     try:
         poll = select.poll()
@@ -80,13 +80,13 @@ def nobody_reads() -> bool:
 
 
 def drop_output() -> None:
-    """Let what is still to be printed go nowhere: Python would fail to flush it at its end."""
+    """Discard output that is not printed yet, which Python would fail to flush at its end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _open_streams() -> None:
-    """Closed standard streams (`>&-`) lead nowhere: the next file opened would be taken for them."""
+    """Open closed standard streams (`>&-`) on the null device, or the next opened file would take their place."""
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(number)
@@ -100,7 +100,7 @@ def _open_streams() -> None:
 
 
 def _watch_signals() -> None:
-    """Handle Ctrl-C and SIGTERM, unless they were ignored from outside (nohup, a job in the background)."""
+    """Handle Ctrl-C and SIGTERM, unless the caller ignores them (nohup, a job in the background)."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
@@ -111,8 +111,8 @@ def _watch_signals() -> None:
 
 
 def _end(number: int, frame: FrameType | None = None) -> None:
-    """Tidy up, say that the program was stopped, and end it."""
-    for number_ in (signal.SIGINT, signal.SIGTERM):  # a second one does not wait for what is tidied up
+    """Tidy up, print the message, and end the program."""
+    for number_ in (signal.SIGINT, signal.SIGTERM):  # a second signal ends the program at once
         with contextlib.suppress(ValueError):  # in another thread
             signal.signal(number_, lambda *_: os._exit(128 + number))
     for tidy in reversed(_tidying):
@@ -121,12 +121,12 @@ def _end(number: int, frame: FrameType | None = None) -> None:
     with contextlib.suppress(Exception):
         sys.stdout.flush()
     with contextlib.suppress(OSError):
-        os.write(2, f"{words(number)}\n".encode())
+        os.write(2, f"{stop_message(number)}\n".encode())
     os._exit(128 + number)
 
 
 def _end_at_last(reader: int) -> None:
-    """End the program where its main thread has not GRACE seconds behind a signal."""
+    """End the program if its main thread has not ended it within GRACE seconds of a signal."""
     while data := os.read(reader, 1):
         if data[0] in (signal.SIGINT, signal.SIGTERM):
             time.sleep(GRACE)
@@ -134,10 +134,10 @@ def _end_at_last(reader: int) -> None:
 
 
 def _flushed(code: int) -> int:
-    """The exit code, once all that was printed has gone out."""
+    """The exit code, after the output is flushed."""
     try:
         sys.stdout.flush()
-    except BrokenPipeError:  # nobody heard the last words, but all is done
+    except BrokenPipeError:  # the reader is gone, but the run is done
         drop_output()
         return code
     except OSError as error:

@@ -33,11 +33,18 @@ if TYPE_CHECKING:
 
 VARIABLE = "DROID_JAX_DISTRIBUTED"
 COORDINATOR, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
-RANKS = (INDEX, "SLURM_PROCID", "OMPI_COMM_WORLD_RANK")  # where a launcher says which process this is
+RANKS = (INDEX, "SLURM_PROCID", "OMPI_COMM_WORLD_RANK")  # set by launchers: number of this process
 HEARTBEAT = 15  # s without a sign of life after which a process counts as lost
 JOINING = 300  # s to wait for all processes
-LEAVING = 7 * 24 * 3600  # s that a process waits at its end for the others: process 0 may try a policy meanwhile
-_LEFT_OUT = (LOCK, "films", "figures", "frames", "tensorboard", "report.html")  # of a folder's copy: nobody reads them
+LEAVING = 7 * 24 * 3600  # s that a process waits at its end for the others; process 0 may evaluate a policy meanwhile
+_LEFT_OUT = (
+    LOCK,
+    "films",
+    "figures",
+    "frames",
+    "tensorboard",
+    "report.html",
+)  # of a folder's copy: no process reads them
 _AGAIN = "the same command goes on from its last checkpoint, with fewer processes too"
 _place = [0, 1]  # index of this process, and how many there are
 _guards: list[subprocess.Popen[bytes]] = []
@@ -68,21 +75,21 @@ def first() -> bool:
 
 
 def rank() -> int:
-    """Number of this process as its launcher says it, whether it has met the others or not; 0 where none says it."""
+    """Number of this process as its launcher states it, also before `join`; 0 where it is not stated."""
     return next((number for name in RANKS if (number := _number(name)) is not None), 0)
 
 
 def join() -> None:
-    """Meet the other processes; call it after `runtime.tune` and before jax computes anything.
+    """Connect to the other processes; call it after `runtime.tune` and before jax computes anything.
 
     Raises:
-        ValueError: nothing says how many processes there are, or they do not find together in JOINING seconds.
+        ValueError: the number of processes is not stated, or they do not connect within JOINING seconds.
     """
     import jax
 
     given = {COUNT: _number(COUNT), INDEX: _number(INDEX)}
     known = os.environ.get(COORDINATOR) and None not in given.values()
-    # jax's own would swallow SIGTERM, which is to end the run.
+    # jax's handler would swallow SIGTERM, which must end the run.
     jax.config.update("jax_enable_preemption_service", False)
     how = f"under Slurm start them with srun, elsewhere set {COORDINATOR} (HOST:PORT of process 0), {COUNT} and {INDEX}"
     _guard(f"the processes of this run did not find together in {JOINING} s: {how}")
@@ -108,7 +115,7 @@ def join() -> None:
 
 
 def over_processes(function: Callable[[Any], Any], values: Any) -> Any:
-    """`function` of rows, each process doing its share of them; all processes get all results, in order.
+    """Values of a function of rows, shared among processes; all processes get all results, in order.
 
     Args:
         function: [n, D] -> pytree of arrays [n, ...] on the host, row by row.
@@ -125,14 +132,14 @@ def over_processes(function: Callable[[Any], Any], values: Any) -> Any:
 
     values = np.asarray(values)
     if values.ndim != 2 or not len(values):
-        return function(values)  # which says what is wrong, in every process alike
+        return function(values)  # which raises the same error in every process
     share = -(-len(values) // count())
     rows = np.minimum(np.arange(index() * share, (index() + 1) * share), len(values) - 1)
     leaves, form = jax.tree.flatten(function(values[rows]))
     leaves = [np.ascontiguousarray(leaf) for leaf in leaves]
     shapes = [(leaf.shape, leaf.dtype.str) for leaf in leaves]
     _check_alike(hashlib.sha256(f"{values.shape} {shapes}".encode() + np.float32(values).tobytes()).digest())
-    # As bytes: jax would make single precision of doubles.
+    # As bytes, because jax would convert doubles to single precision.
     packed = np.concatenate([leaf.reshape(share, -1).view(np.uint8).reshape(share, -1) for leaf in leaves], axis=1)
     found, at, parts = _allgather(packed), 0, []
     for leaf in leaves:
@@ -144,14 +151,16 @@ def over_processes(function: Callable[[Any], Any], values: Any) -> Any:
 
 
 def agreed(decision: bool) -> bool:
-    """What process 0 decided: for decisions that depend on a clock, on which processes differ."""
+    """The decision of process 0, for decisions that depend on a clock, which differs between processes."""
     return decision if count() == 1 else _gathered(bytes([decision]))[0] == b"\1"
 
 
 @contextlib.contextmanager
 def part(folder: Path | None) -> Iterator[Path | None]:
-    """A process's part in a command.  jax lets all processes wait for each other when they end, and not before: one
-    exchange of results (`over_processes`) waits for 30 minutes at most.
+    """Context of a command in each process.
+
+    jax makes all processes wait for each other when they end.  Before that, an exchange of results (`over_processes`)
+    waits for 30 minutes at most.
 
     Args:
         folder: the results folder; None for none.
@@ -179,8 +188,9 @@ def part(folder: Path | None) -> Iterator[Path | None]:
 
 
 def leave(code: int) -> int:
-    """The exit code of a process, which ends at once where it failed: its end would wait for the others, and they for
-    its replays.
+    """The exit code; a process that failed ends at once.
+
+    Otherwise it would wait for the others to end, and they for its replays.
     """
     if count() > 1 and code:
         _dismiss()
@@ -192,7 +202,7 @@ def leave(code: int) -> int:
 
 
 def speaker() -> str:
-    """Begins the line about an error: which process has it; empty in process 0."""
+    """Beginning of an error message, which names the process; empty in process 0."""
     return "" if first() else f"process {index()} of {count()}: "
 
 
@@ -205,7 +215,7 @@ def _number(name: str) -> int | None:
 
 
 def _check_alike(digest: bytes) -> None:
-    """RuntimeError where other processes have another digest of what they replay."""
+    """RuntimeError where other processes have another digest of the replays they ask for."""
     other = [str(number) for number, each in enumerate(_gathered(digest)) if each != digest]
     if other:
         raise RuntimeError(
@@ -249,7 +259,7 @@ def _lost(error: Exception) -> Lost:
 
 
 def _packed(folder: Path) -> bytes:
-    """A folder as tar, without what nobody reads; an empty one where it is missing."""
+    """A folder as tar, without files that no process reads; an empty tar where it is missing."""
     import tarfile
 
     buffer = io.BytesIO()
@@ -291,8 +301,9 @@ def _to_null(descriptor: int) -> Iterator[None]:
 
 
 def _guard(line: str) -> None:
-    """Let a shell say this error where jax ends the process because another one is lost or does not come: it aborts
-    the program, with a stack of its own functions and without an exception.
+    """Start a shell that prints this error if jax aborts the process because another one is lost or does not connect.
+
+    jax then aborts with a stack of its own functions and without an exception.
     """
     import subprocess
 
@@ -303,7 +314,7 @@ def _guard(line: str) -> None:
 
 
 def _dismiss() -> None:
-    """The guard has nothing to say: this process ends in its own way."""
+    """End the guards without a message, because this process ends normally."""
     while _guards:
         guard = _guards.pop()
         with contextlib.suppress(OSError):

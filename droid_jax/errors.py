@@ -1,4 +1,4 @@
-"""What errors of several layers say alike."""
+"""Texts that error messages of several layers share."""
 
 from __future__ import annotations
 
@@ -9,21 +9,24 @@ from droid_jax.arguments import shown
 
 
 def faults(found: Mapping[str, Collection[str]]) -> str:
-    """ "missing: a, b; unknown: c": what is wrong and the names it is wrong with; empty where no names are."""
+    """Kinds of faults with the names concerned: "missing: a, b; unknown: c"; empty where there are no names."""
     return "; ".join(f"{what} {named(names)}" for what, names in found.items() if names)
 
 
 def named(names: Iterable[str], most: int = 20) -> str:
-    """ "a, b and 3 more": names of a file or a caller, printable and cut where they are long."""
+    """A list of names for a message: "a, b and 3 more"; printable, and cut where it is long."""
     texts = [shown(name).strip("'") for name in names]
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return ", ".join(texts[:most]) + more
 
 
 def lacking(what: str, extra: str, *packages: str) -> str:
-    """ "export needs onnx and what to type" where one of the packages is not installed; empty where all are.
+    """A message that names the packages that are not installed and how to install them; empty where all are.
 
-    what: with its verb, "export needs".  extra: of this project, which brings the packages.
+    Args:
+        what: beginning of the message, "export needs".
+        extra: the project's extra that installs the packages.
+        packages: names of the packages.
     """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     how = f"in the checkout, pip install -c constraints.txt -e '.[{extra}]'"
@@ -31,15 +34,15 @@ def lacking(what: str, extra: str, *packages: str) -> str:
 
 
 def needs(what: str, extra: str, *packages: str) -> None:
-    """ValueError that says so where something is `lacking`."""
-    if told := lacking(what, extra, *packages):
-        raise ValueError(told)
+    """ValueError with the message of `lacking` where a package is not installed."""
+    if message := lacking(what, extra, *packages):
+        raise ValueError(message)
 
 
 def reason(error: BaseException) -> str:
-    """Why something was not made, in one line: an error's message; with its type where that says no more than a name.
+    """An error's message in one line; with its type, except for ValueError and OSError.
 
-    Of ours (ValueError, OSError) the message is a sentence; of others the type says what it is about.
+    Messages of ValueError and OSError are sentences.  Those of other errors are often a mere name.
     """
     lines = str(error).strip().splitlines()
     said = lines[0].strip() if lines else ""

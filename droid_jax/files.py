@@ -1,4 +1,4 @@
-"""Names of files in a run's folder that one layer writes and another reads; light, for the command line."""
+"""Names of files in a run's folder that one layer writes and another reads; imports nothing."""
 
 SETUP, CONFIG, FIT = "setup.json", "config.json", "fit.json"
 GAUSSIAN, SAMPLES = "gaussian.json", "samples.csv"
@@ -6,13 +6,13 @@ FULL_GAUSSIAN = "gaussian_full.json"  # with the nuisances
 TRACES, CORRELATION, DISTRIBUTION = "traces.npz", "correlation.npz", "distribution.npz"
 HISTORY, HISTORY_TABLE = "history.npz", "history.csv"
 FITTED, REPLAY, REPLAY_FILM = "fitted.xml", "replay.npz", "replay.webp"
-# A fit for programs that have MuJoCo and not this one.
+# A fit for programs that have MuJoCo but not droid_jax.
 NEUTRAL = FITTED_JSON, APPLY_FIT, MJLAB_TERMS = "fitted.json", "apply_fit.py", "mjlab_terms.py"
 VIEWER = "viewer.html"  # measured and simulated motion in a browser
 ASKED = "all.json"  # the options of a run of all stages, beside their folders
 GAP, GAP_TRACES = "gap.json", "gap.npz"
 FIT_VERSION, GAP_VERSION = 3, 2  # of fit.json and gap.json
-LOST = "the fitted model on the test recording"  # in "failed" of gap.json: that recording has no discrepancies then
+LOST = "the fitted model on the test recording"  # in "failed" of gap.json, where that replay failed: no U of it then
 # States in "amendments" of gap.json: the run was stopped before; "not made: " and the reason.
 TO_BE_MADE, NOT_MADE = "to be made", "not made"
 EXTENDED, EXTENDED_MJCF = "extended.json", "extended.xml"
@@ -24,17 +24,17 @@ SYNTHETIC_ROBOT = (
     "synthetic_robot.json"  # beside the synthetic robot's recordings: its springs, seed and hidden effects
 )
 SYNTHETIC_SOURCE = "synthetic robot (plain C MuJoCo), not a real one"  # in the metadata of what it recorded
-# Folders in one of `all`, and what is written last in each: its presence says that the run is whole.
+# Folders inside that of `all`, and the file that is written last in each: where it exists, the run is complete.
 LAST_FILES = {"identify": CONFIG, "gap": GAP, "train": TRAINING}
-# What else is in them that would be taken for the next run's.
+# Other results in them, which could be mistaken for those of the next run.
 RESULTS = {
     "identify": (FIT, GAUSSIAN, FULL_GAUSSIAN, EXTENDED),
     "gap": (GAP_TRACES, EXTENDED, EXTENDED_MJCF, "extended.patch", "extended_parts", *NEUTRAL),
     "train": (POLICY, TRANSFER, EXTENDED, FILMS, "export"),
 }
-# Held while a run writes to the folder; not there otherwise.
+# Exists while a run writes to the folder.
 LOCK = ".droid_jax.lock"
-# Every name that a stage writes in its folder, or removes there before it begins.
+# All files that a stage writes in its folder, or removes there before it begins.
 WRITTEN: dict[str, tuple[str, ...]] = {
     stage: (SETUP, last, *RESULTS[stage], "report.html", "figures", "checkpoints", "tensorboard")
     for stage, last in LAST_FILES.items()

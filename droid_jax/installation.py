@@ -1,7 +1,7 @@
-"""Is the installed MuJoCo one whole version?  Asked before it is imported: files of two versions may crash.
+"""Checks, before MuJoCo is imported, that all its files are of one version: a mixture may crash.
 
-MuJoCo 4 is three distributions (mujoco-core, mujoco-studio, mujoco) that share the folder of MuJoCo 3's one.  An
-installer that puts one over the other leaves files of both there.
+MuJoCo 4 consists of three distributions (mujoco-core, mujoco-studio, mujoco), which share the folder of MuJoCo 3's
+only distribution.  An installer that puts one over the other leaves files of both.
 Source: MuJoCo's release notes of 4.0.0, which name the commands that mend it.
 """
 
@@ -13,12 +13,12 @@ import re
 from pathlib import Path
 
 PARTS = ("mujoco", "mujoco-core", "mujoco-studio")  # of MuJoCo 4; MuJoCo 3 is the first alone
-MEND = 'python -m pip uninstall -y mujoco mujoco-core mujoco-studio && python -m pip install "mujoco>=3.17,<5"'
+REINSTALL = 'python -m pip uninstall -y mujoco mujoco-core mujoco-studio && python -m pip install "mujoco>=3.17,<5"'
 _LIBRARY = re.compile(r"mujoco\D*?(\d+\.\d+\.\d+)")
 
 
 class MixedInstallation(ImportError, ValueError):
-    """Files of two versions of MuJoCo; the message says which, where, and how to mend it."""
+    """Files of two versions of MuJoCo; the message says which, where, and how to reinstall."""
 
 
 def check_mujoco() -> None:
@@ -29,12 +29,12 @@ def check_mujoco() -> None:
     """
     found = importlib.util.find_spec("mujoco")
     if found is None or not found.submodule_search_locations:
-        return  # importing it says so
+        return  # importing it raises the error
     check_files_of(Path(found.submodule_search_locations[0]), installed())
 
 
 def installed() -> dict[str, str]:
-    """Version by distribution, of those that make MuJoCo and are there."""
+    """Version of each installed distribution of MuJoCo."""
     out: dict[str, str] = {}
     for name in PARTS:
         try:
@@ -45,11 +45,11 @@ def installed() -> dict[str, str]:
 
 
 def check_files_of(folder: Path, versions: dict[str, str]) -> None:
-    """MixedInstallation where distributions differ, or the folder holds a C library of a version that none of them is.
+    """MixedInstallation where distributions differ in version, or the C library has a version that none of them has.
 
     Args:
         folder: the package `mujoco`.
-        versions: of the distributions; none at all says nothing (a checkout on the path).
+        versions: of the distributions; without any (a checkout on the path), nothing is checked.
     """
     stated = {version.split("+")[0] for version in versions.values()}
     libraries = {m[1] for path in folder.glob("*mujoco*") if (m := _LIBRARY.match(path.name.removeprefix("lib")))}
@@ -57,10 +57,10 @@ def check_files_of(folder: Path, versions: dict[str, str]) -> None:
     parts = [name for name in versions if name != "mujoco"]
     if len(stated) > 1 or (old and parts):
         said = ", ".join(f"{name} {version}" for name, version in versions.items())
-        raise MixedInstallation(f"{folder} holds files of two versions of MuJoCo ({said}); mend it with: {MEND}")
+        raise MixedInstallation(f"{folder} holds files of two versions of MuJoCo ({said}); reinstall with: {REINSTALL}")
     if stated and libraries - stated:
         said = ", ".join(sorted(libraries - stated))
         raise MixedInstallation(
             f"{folder} holds files of MuJoCo {said} beside those of {', '.join(sorted(stated))}, which is installed; "
-            f"mend it with: {MEND}"
+            f"reinstall with: {REINSTALL}"
         )

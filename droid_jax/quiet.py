@@ -1,12 +1,10 @@
-"""Messages of other programs that nobody can do anything about are left out; all else they print is printed.
-
-Three of them:
+"""Suppresses three messages of other programs that the user can do nothing about; prints everything else.
 
 - mujoco.mjx prints two lines where warp is not installed, which it only needs on some GPUs.
-- matplotlib says, in two lines, where it keeps its fonts' list if there is no home to keep it in.
-- XLA writes errors of 2 kB when it loads a compiled CPU program from the cache: about two tuning preferences that it
-  gives itself when it compiles and that no host can report (openxla/xla#44565), and about versions that jax's key to
-  the cache contains.  Compiled programs lie in a folder of this processor's, see `runtime.tune`.
+- matplotlib prints two lines about the folder of its font list if there is no home folder.
+- XLA prints errors of 2 kB when it loads a compiled CPU program from the cache.  They are about two tuning preferences
+  that it sets itself and that no host can report (openxla/xla#44565), and about versions, which jax's cache key
+  contains.  The cache has a folder for each kind of processor, see `runtime.tune`.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from typing import Any
 
 from droid_jax.installation import check_mujoco
 
-LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"  # read once, when jaxlib is loaded
+LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL"  # jaxlib reads it once, when it is loaded
 _NO_WARP = (
     "Failed to import warp: No module named 'warp'",
     "Failed to import mujoco_warp: No module named 'warp'",
@@ -79,7 +77,7 @@ def import_mjx() -> ModuleType:
 
 
 def before_jax() -> None:
-    """Let XLA keep its log to itself, where jax is not imported yet and nobody chose otherwise."""
+    """Switch XLA's log off, where jax is not imported yet and the user has not set the level."""
     if "jaxlib" not in sys.modules:
         os.environ.setdefault(LOG_LEVEL, "3")
         _settled.append(os.environ[LOG_LEVEL])
@@ -92,7 +90,7 @@ def quiet_cache() -> None:
     try:
         cache: Any = importlib.import_module("jax._src.compilation_cache")
         load = cache.get_executable_and_time
-    except (ImportError, AttributeError):  # another jax: then its messages are seen
+    except (ImportError, AttributeError):  # another version of jax, whose messages are printed
         return
     if hasattr(load, "quiet"):
         return
@@ -108,7 +106,7 @@ def quiet_cache() -> None:
 
 @contextlib.contextmanager
 def _without(pattern: re.Pattern[bytes]) -> Iterator[None]:
-    """Leave out the lines that match of what is written to the process's standard error inside the block.
+    """Suppress matching lines on the process's standard error inside the block.
 
     Everything else, of other threads too, appears when the block ends.
     """

@@ -1,4 +1,4 @@
-"""The one reader of JSON: bounded in size and depth, no number that is not finite, types as a schema says.
+"""Reads JSON, bounded in size and depth, with finite numbers only, and checks types by a schema.
 
 content = read_json(path)                      # plain values, or ValueError with file and place
 settings = typed(content, Settings, str(path)) # as a msgspec.Struct or TypedDict says
@@ -42,7 +42,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The same of a text; where: what it belongs to, begins the message."""
+    """The content of a JSON text as plain values; where: the file, begins the message."""
     if len(text) > MOST_BYTES:
         raise ValueError(f"{where}: {len(text)} characters of JSON, at most {MOST_BYTES} are read")
     try:
@@ -60,7 +60,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def typed(value: Any, kind: type[Content], where: str) -> Content:
-    """A parsed value as its type says; ValueError names the place and what is wrong there.
+    """A parsed value converted to a type; ValueError names the place and what is wrong there.
 
     Args:
         value: of `read_json` or `parse_json`.
@@ -90,7 +90,7 @@ def _no_number(word: str) -> float:
 
 
 def _fault(value: Any) -> str:
-    """What is wrong with the first scalar or key that no file may hold, with its place; empty where nothing is."""
+    """Fault and place of the first scalar or key that is not allowed in any file; empty where there is none."""
     waiting: list[tuple[Any, tuple[Any, ...]]] = [(value, ())]
     while waiting:
         item, place = waiting.pop()
@@ -138,7 +138,7 @@ _WORDS = {
 
 
 def _sentence(value: Any, kind: Any, said: str) -> str:
-    """What msgspec says of a value in our words, the place first."""
+    """msgspec's message about a value, in this program's words, with the place first."""
     said, _, path = said.partition(" - at `")
     if path.startswith("key in"):
         return f": {said}"
@@ -175,7 +175,7 @@ def _values(node: Any) -> Iterator[Any]:
 
 
 def _inner(node: Any, key: Any, found: Any) -> Any:
-    """The type of what stands at a key of a value of a type."""
+    """The type of a key's value in an object of a given type."""
     options = node.types if isinstance(node, inspect.UnionType) else (node,)
     for option in options:
         if isinstance(found, dict) and isinstance(option, (inspect.StructType, inspect.TypedDictType)):
@@ -206,7 +206,7 @@ def _place(value: Any, kind: Any, said: str, path: str) -> tuple[Any, ...]:
 
 
 def _with(value: Any, place: list[Any], new: Any) -> Any:
-    """A copy of a value with something else at a place."""
+    """A copy of a value with another entry at one place."""
     if not place:
         return new
     copy = dict(value) if isinstance(value, dict) else list(value)

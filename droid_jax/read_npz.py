@@ -1,4 +1,4 @@
-"""The one reader of npz files: the arrays that are asked for, their sizes known before memory is taken.
+"""Reads requested arrays of npz files; checks their sizes before it allocates memory.
 
     with NpzFile(path) as file:
         time = file.array("time")
@@ -6,8 +6,9 @@
 
     arrays = read_npz(path, ("names", "mean"), optional=("sigma",))
 
-An npz is a zip of npy files.  What its directory and the head of a member declare is checked against the bytes that are
-there; a small file that declares a large array takes no memory.  numpy is imported where a file is opened.
+An npz is a zip of npy files.  The sizes declared in its directory and in the heads of its members are checked against
+the bytes of the file, so that a small file that declares a large array takes no memory.  numpy is imported when a file
+is opened.
 """
 
 from __future__ import annotations

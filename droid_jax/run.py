@@ -1,7 +1,7 @@
-"""The command line: parses, calls, writes.  `python -m droid_jax.run --help`
+"""The command line: `python -m droid_jax.run --help`.
 
-The commands are in `droid_jax.commands`; heavy modules are imported inside them, after `runtime.tune()`
-and so that --help is quick.
+The commands are in `droid_jax.commands`.  They import heavy modules inside their functions, after `runtime.tune()`, so
+that --help is quick.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 
-if __name__ == "__main__":  # before what is imported below, which takes a while: a stop meanwhile is no traceback
+if __name__ == "__main__":  # before the imports below, which take a while: Ctrl-C then causes no traceback
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: (os.write(2, b"interrupted\n"), os._exit(130)))
     from droid_jax.console import program
@@ -81,7 +81,7 @@ _ACTIONS: dict[type, Callable[[Any], None]] = {
 
 SCRIPT = "droid-jax"  # as pyproject.toml installs it
 WHOLE = ("-h", "--help", "--tyro-")  # options of the program itself: help, shell completion
-# Errors of the machine, not of what it was given: no room, a quota, a file larger than allowed, a broken disk.
+# Errors of the machine and not of the input: full disk, quota, file size limit, broken disk.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 RESUMED = (
     all_stages.All,
@@ -89,19 +89,19 @@ RESUMED = (
     gap.GapCommand,
     train.Train,
     rehearse.Rehearse,
-)  # commands that go on where they were stopped
-SHARED = (all_stages.All, identify.Identify, gap.GapCommand)  # commands of which several processes do a part each
-WHAT = """From recordings of a robot to a fitted simulation, to what that simulation lacks, and to a policy.
+)  # commands that continue after a stop
+SHARED = (all_stages.All, identify.Identify, gap.GapCommand)  # commands that several processes share
+WHAT = """Fits a simulation to recordings of a robot, searches for missing effects, and trains a policy.
 
-Without a command: `all`, on a synthetic robot.  --version says which version this is."""
+Without a command: `all`, on a synthetic robot.  --version prints the version."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; what goes wrong ends with one line on stderr and the exit code of `console`."""
+    """Run a command.  An error prints one line to stderr; the exit codes are those of `console`."""
     BEGUN.clear()
     given = _given(list(sys.argv[1:] if arguments is None else arguments))
     command: Any = None
-    with console.last_words(lambda: _going_on(command)):
+    with console.stop_advice(lambda: _going_on(command)):
         try:
             if given == ["--version"]:
                 print(f"droid_jax {importlib.metadata.version('droid_jax')}")
@@ -131,8 +131,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run_together(command: Any) -> None:
     """Run a command in several processes (`distributed`).
 
-    One that they do not share is the first's, which does not meet the others: a replay would wait for them, and brax
-    would train on the devices of all.
+    A command that is not shared runs only in the first process, without connecting to the others: otherwise replays
+    would wait for them, and brax would train on the devices of all.
     """
     from droid_jax import runtime
 
@@ -151,8 +151,9 @@ def _run_together(command: Any) -> None:
 
 
 def _own_part(command: Any, folder: Path | None) -> Any:
-    """What this process does of a shared command: all where batches are replayed, else nothing, unless it is the
-    first.
+    """The part of a shared command that this process runs; None for nothing.
+
+    The first process runs all of it, the others the stages that replay batches.
     """
     if distributed.first():
         return command
@@ -163,24 +164,24 @@ def _own_part(command: Any, folder: Path | None) -> Any:
 
 
 def _given(arguments: list[str]) -> list[str]:
-    """The arguments, the command `all` named where none is."""
+    """The arguments, with the command `all` added if none is given."""
     if arguments == ["--version"] or (arguments and not arguments[0].startswith("-")):
         return arguments
     return arguments if arguments and arguments[0].startswith(WHOLE) else ["all", *arguments]
 
 
 def _ended(error: BaseException, command: Any) -> int | None:
-    """The exit code for what ended a command, once it is said; None for an error of the program itself."""
+    """Print the error that ended a command and return the exit code; None for a bug of the program."""
     who = distributed.speaker()
-    if isinstance(error, KeyboardInterrupt):  # where main is called by another program: `console` lets none through
-        print(console.words(signal.SIGINT), file=sys.stderr)
+    if isinstance(error, KeyboardInterrupt):  # only if another program calls main; otherwise `console` handles it
+        print(console.stop_message(signal.SIGINT), file=sys.stderr)
         return 128 + signal.SIGINT
-    if isinstance(error, BrokenPipeError) and console.nobody_reads():
+    if isinstance(error, BrokenPipeError) and console.reader_gone():
         console.drop_output()
-        if command is None:  # --help | head: nobody reads on, which is no error
+        if command is None:  # --help | head is no error
             return 0
-        if how := _going_on(command):  # others stop without a word, as in a shell
-            print(f"stopped: nobody reads the output any more{how}", file=sys.stderr)
+        if how := _going_on(command):  # other commands stop silently, as in a shell
+            print(f"stopped: the output is no longer read{how}", file=sys.stderr)
         return console.CLOSED
     if isinstance(error, OSError) and error.errno in FULL:
         place = f"{error.filename}: " if error.filename else "what was to be written: "
@@ -199,22 +200,22 @@ def _ended(error: BaseException, command: Any) -> int | None:
 
 
 def _one_sentence(error: Exception) -> str:
-    """An error's text; of the file system's, the file first and without its number."""
+    """An error's text; for file system errors the file and the reason, without the number."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror[:1].lower()}{error.strerror[1:]}"
     return str(error)
 
 
 def _check_seeds(command: Any) -> None:
-    """ValueError for a negative seed, of which numpy's generators say less."""
-    for name in ("seed", "robot"):  # of what is drawn, and of the synthetic robot
+    """ValueError for a negative seed, with a clearer message than numpy's."""
+    for name in ("seed", "robot"):  # of the random draws, and of the synthetic robot
         if (value := getattr(command, name, None)) is not None and value < 0:
             raise ValueError(f"--{name} must not be negative, got {value}")
 
 
 @contextlib.contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Warnings for people (UserWarning) in one line without the place in the code that gave them."""
+    """Print a UserWarning in one line, without its place in the code."""
     usual = warnings.formatwarning
 
     def plain(message: Any, category: type[Warning], *place: Any, **more: Any) -> str:
@@ -228,7 +229,7 @@ def _plain_warnings() -> Iterator[None]:
 
 
 def _names_nothing(arguments: Sequence[str], option: str) -> bool:
-    """Whether an option stands there without values, which would be the same as leaving it away."""
+    """Whether an option is given without values, which would otherwise count as not given."""
     if option not in arguments:
         return False
     behind = [*arguments, "-"][list(arguments).index(option) + 1]
@@ -236,7 +237,7 @@ def _names_nothing(arguments: Sequence[str], option: str) -> bool:
 
 
 def _going_on(command: Any) -> str:
-    """How an interrupted command goes on, where it can."""
+    """How to continue an interrupted command; empty if that is not possible."""
     if not isinstance(command, RESUMED):
         return ""
     how = "the same command without --again" if getattr(command, "again", False) and BEGUN else "the same command"

@@ -1,7 +1,7 @@
-"""The machine: settings to make before jax starts, and what to write down about a run.
+"""Settings to make before jax starts, and a description of the machine for results.
 
 Importing this module neither imports jax nor sets anything.  A program calls `tune()` first;
-a library user may do without it and pass `compiler_options()` to their own `jax.jit`.
+a library user may instead pass `compiler_options()` to their `jax.jit`.
 
 Why the fusion emitters are switched off: XLA's CPU backend fuses the kinematic chain of a
 seven-joint arm into one expression that recomputes its producers again and again, thousands of
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 EMITTERS = "xla_cpu_use_fusion_emitters"
-# Allocations before a collection: a trace makes millions of small objects, and looking for cycles among them takes a
-# tenth of its time with Python's own (700, 10, 10).
-COLLECT = (50_000, 10, 10)
-# Of float32 matrix products.  By its own default a GPU rounds their factors to 10 bits (TF32): on an H200 the door's
+# Thresholds of Python's garbage collector.  A trace makes millions of small objects; with Python's own (700, 10, 10)
+# the search for cycles among them takes a tenth of its time.
+GARBAGE_THRESHOLDS = (50_000, 10, 10)
+# Precision of float32 matrix products.  By default a GPU rounds their factors to 10 bits (TF32): on an H200 the door's
 # torques then differ by up to 8e-3 N m from a CPU's, in full precision by 3e-4, at the same speed.
 PRODUCTS = "highest"
 CACHE_VARIABLE = "DROID_JAX_CACHE"
@@ -50,7 +50,7 @@ _DEVICE_COUNT = "--xla_force_host_platform_device_count="
 
 @dataclass(frozen=True)
 class Runtime:
-    """What `tune` settled.
+    """The settings that `tune` made.
 
     devices: virtual CPU devices.
     emitters_off: whether every CPU compilation leaves the fusion emitters out.
@@ -92,13 +92,13 @@ def tune(devices: int | None = None, cache_dir: str | Path | None = None) -> Run
     _leave_shardy()
     if _setting("jax_default_matmul_precision") is None:
         jax.config.update("jax_default_matmul_precision", PRODUCTS)
-    gc.set_threshold(*COLLECT)
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
 
     count = devices or _configured_devices() or cores()
     flags = _with_emitters_off(os.environ.get("XLA_FLAGS", ""), root)
     try:
         jax.config.update("jax_num_cpu_devices", count)
-    except RuntimeError:  # jax refuses this setting from the moment its backends exist
+    except RuntimeError:  # jax refuses this setting once its backends exist
         _check_running(count, flags)
     else:
         os.environ["XLA_FLAGS"] = flags
@@ -166,7 +166,7 @@ def versions() -> dict[str, str]:
 
 
 def device() -> str:
-    """What jax computes on, for people: "AMD EPYC, 2 cores" or "2 x NVIDIA H200"."""
+    """The processors that jax uses, as text: "AMD EPYC, 2 cores" or "2 x NVIDIA H200"."""
     import jax
 
     each = f"{distributed.count()} processes, each on " if distributed.count() > 1 else ""
@@ -221,20 +221,22 @@ def _granted(group: Path) -> list[float]:
 
 @functools.cache
 def start() -> None:
-    """Tune and import what a command needs, and say so, since it takes seconds; the second time nothing happens."""
+    """Tune, import jax and MJX, and print a line, since it takes seconds; only the first call does anything."""
     print("starting jax ...", flush=True)
     tune()
     import_mjx()
 
 
 def _leave_shardy() -> None:
-    """Take jax's older partitioner where the newer one crashes: from jax 0.11 on, the compiler dies of a shard_map over
-    several devices whose function closes over an mjx.Model (seen with 0.11.2 on a CPU; not with 0.9 and on one device).
+    """Select jax's older partitioner where the newer one crashes.
+
+    From jax 0.11 on, the compiler crashes on a shard_map over several devices whose function closes over an mjx.Model
+    (seen with 0.11.2 on a CPU; not with 0.9, and not on one device).
     """
     import jax
 
     if tuple(int(part) for part in jax.__version__.split(".")[:2]) >= (0, 11):
-        with contextlib.suppress(AttributeError):  # a jax that no longer has the choice
+        with contextlib.suppress(AttributeError):  # a version of jax without this choice
             jax.config.update("jax_use_shardy_partitioner", False)
 
 
@@ -246,7 +248,7 @@ def _setting(name: str) -> Any:
 
 
 def _configured_devices() -> int | None:
-    """Virtual CPU devices that are chosen already, in jax's settings or in XLA_FLAGS; None for no choice."""
+    """Number of virtual CPU devices that jax's settings or XLA_FLAGS state; None where they state none."""
     configured = _setting("jax_num_cpu_devices")
     if configured > 0:
         return configured
@@ -255,7 +257,7 @@ def _configured_devices() -> int | None:
 
 
 def _with_emitters_off(flags: str, root: Path | None) -> str:
-    """XLA_FLAGS with the emitters off, unless the user decided or this jaxlib lacks the flag."""
+    """XLA_FLAGS with the emitters off, unless the user set the flag or this jaxlib lacks it."""
     if any(f.startswith(f"--{EMITTERS}") for f in flags.split()) or not _flag_known(root):
         return flags
     return f"{flags} {_EMITTERS_OFF}".strip()
@@ -279,7 +281,7 @@ def _check_running(devices: int, flags: str) -> None:
 
 
 def _flag_known(root: Path | None) -> bool:
-    """Whether this jaxlib knows the flag; asked once per jaxlib version and cache folder."""
+    """Whether this jaxlib knows the flag; tested once per jaxlib version and cache folder."""
     version = importlib.metadata.version("jaxlib")
     answers = root / f"flag-{EMITTERS}-jaxlib-{version}.json" if root else None
     if answers and answers.is_file():
@@ -290,13 +292,13 @@ def _flag_known(root: Path | None) -> bool:
         warnings.warn(f"could not find out whether jaxlib {version} knows {_EMITTERS_OFF}", stacklevel=4)
         return False
     if answers:
-        with contextlib.suppress(OSError):  # a full disk: asked again the next time
+        with contextlib.suppress(OSError):  # a full disk: tested again the next time
             write_json(answers, known)
     return known
 
 
 def _probe_flag(flag: str) -> bool | None:
-    """Start jax with one XLA flag in a process of its own, since an unknown flag aborts it.
+    """Start jax with one XLA flag in a separate process, since an unknown flag aborts it.
 
     None when the process failed for another reason.
     """
@@ -334,7 +336,7 @@ def _cache_root(cache_dir: str | Path | None) -> Path | None:
         root.mkdir(parents=True, exist_ok=True)
         if not os.access(root, os.W_OK):
             raise PermissionError(f"the cache folder {root} is not writable")
-    except (OSError, RuntimeError) as error:  # RuntimeError: nobody knows this user's home
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no known home folder
         if chosen:
             raise OSError(f"the cache folder {chosen} cannot be written: {error}") from None
         warnings.warn(
@@ -347,14 +349,14 @@ def _cache_root(cache_dir: str | Path | None) -> Path | None:
 
 
 def _use_cache(root: Path | None, cache_dir: str | Path | None) -> Path | None:
-    """Switch the persistent compilation cache on; a folder that jax was given already stays."""
+    """Switch the persistent compilation cache on; keeps a folder that is already set in jax."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
     before = _setting("jax_compilation_cache_dir")
     if root is None or (before and cache_dir is None):
         return Path(before) if before else None
-    # Compiled CPU programs hold this processor's instructions, and jax's key does not name it.
+    # Compiled CPU programs hold instructions of this processor, which is not part of jax's cache key.
     folder = root / "xla" / _processor_key()
     folder.mkdir(parents=True, exist_ok=True)
     if before and before != str(folder):

@@ -1,13 +1,12 @@
-"""Writing files and folders whole or not at all; reading text.
+"""Writes files and folders atomically; reads text.
 
-What is written stands beside its final name first and is then moved there: a reader sees the old
-content or the new one, and a run that is killed or finds the disk full leaves the old one behind.
-Folders alone have an instant between the two: a run killed then leaves old and new beside the name,
-in a folder that begins with a dot and it.
-Folders that are missing are made.  OSError, with the file's name, where a place cannot be written.
+Content is first written under a temporary name beside its final one and then moved there.  A reader sees the old or the
+new content, and a run that is killed or finds the disk full leaves the old one.  Replacing a folder takes two moves: a
+run that is killed between them leaves the old and the new folder beside the name, in a folder whose name begins with a
+dot.  Missing folders are made.  An OSError with the file's name is raised where a path cannot be written.
 
-Only plain files and folders are replaced: a device, a pipe, a socket, a symbolic link, or a folder where a file is to
-be, is a ValueError.  Whoever writes to a name that somebody gave also says which content is this program's own
+Only plain files and folders are replaced.  A device, a pipe, a socket, a symbolic link, or a folder in place of a file
+is a ValueError.  Code that writes to a path given by the user also checks that existing content is this program's
 (`refuse_foreign`, `write_own`).
 """
 
@@ -45,7 +44,7 @@ _KINDS = (
 
 
 def kind_of(path: Path) -> str:
-    """ "a file", "a folder", "a device" ...: what stands at a path, links not followed; empty where nothing does."""
+    """Kind of a path: "a file", "a folder", "a device", ...; links are not followed; empty where none exists."""
     try:
         mode = os.lstat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -54,7 +53,7 @@ def kind_of(path: Path) -> str:
 
 
 def refuse_foreign(path: Path, wanted: str, own: Callable[[Path], bool], what: str) -> None:
-    """ValueError where something stands at a path that is not this program's to replace.
+    """ValueError where a path holds a file or folder that this program did not write.
 
     Args:
         path: where something is to be written.
@@ -83,13 +82,13 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """A file of these bytes; an existing one is replaced, and who may read it stays as it was."""
+    """Write a file of these bytes; an existing one is replaced and its permissions are kept."""
     refuse_special(path, "a file")
     temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(4)}")
     with _named(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with temporary.open("xb") as file:  # not mkstemp: that keeps others out, whatever the umask says
+            with temporary.open("xb") as file:  # not mkstemp, which ignores the umask and excludes other users
                 file.write(content)
             with contextlib.suppress(FileNotFoundError):
                 temporary.chmod(stat.S_IMODE(path.stat().st_mode))
@@ -99,14 +98,14 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Files of these contents in a folder that others may keep files in too.
+    """Write files of these contents in a folder that may hold files of others too.
 
     Args:
         folder: made where it is missing.
         files: content by name.
 
     Raises:
-        ValueError: a file of one of the names is not one that an earlier call wrote, or was changed since.
+        ValueError: a file of one of these names was not written by an earlier call, or was changed since.
     """
     refuse_special(folder, "a folder")
     known = _written(folder)
@@ -117,7 +116,7 @@ def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
                 f"{folder / name} was not written by this program, or was changed since: it is not replaced; give "
                 "another folder (--out), or move it away"
             )
-    # First, with what was written before: after a stop on the way old and new files are known as this program's.
+    # Written first, with the old hashes: after a stop in between, both old and new files are known as this program's.
     now = {name: sorted({*known.get(name, ()), _sha256(content)}) for name, content in files.items()}
     write_json(folder / WRITTEN, {**known, **now})
     for name, content in files.items():
@@ -125,7 +124,7 @@ def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _written(folder: Path) -> dict[str, list[str]]:
-    """SHA-256 of all that `write_own` ever wrote, by name; empty where that is not known."""
+    """SHA-256 of all contents that `write_own` wrote in the folder, by name; empty where there is no such file."""
     from droid_jax.read_json import read_json, typed  # only here: it imports this module
 
     try:
@@ -166,7 +165,7 @@ def read_text(path: Path, most: int = 64 * 2**20) -> str:
 
 
 def write_json(path: Path, content: Any, *, indent: int = 1) -> None:
-    """A JSON file; ValueError for NaN and infinities, which JSON has no word for."""
+    """Write a JSON file; ValueError for NaN and infinities, which JSON cannot express."""
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
 
 
@@ -176,12 +175,12 @@ def file_sha256(path: Path) -> str:
 
 
 def finite(number: float) -> float | None:
-    """The number, or None for NaN and infinities: what `write_json` takes."""
+    """The number, or None for NaN and infinities, which `write_json` refuses."""
     return float(number) if math.isfinite(number) else None
 
 
 def config_json(config: Any) -> dict[str, Any]:
-    """Settings as plain data, so that a result can be reproduced from its own file.
+    """Settings as plain data, to be stored in a result so that it can be reproduced.
 
     Args:
         config: a dataclass; its fields may be dataclasses, enumerations, mappings, sequences, numbers, texts or None.
@@ -193,7 +192,7 @@ def config_json(config: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A setting's value as JSON has it."""
+    """A setting's value as plain JSON data."""
     if dataclasses.is_dataclass(value):
         return config_json(value)
     if isinstance(value, enum.Enum):
@@ -213,7 +212,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
-    """What `write_npz` writes: the same bytes for the same arrays."""
+    """Content of an npz file: the same bytes for the same arrays."""
     import numpy as np  # only here: droid_jax.runtime imports this module, and `--help` waits for that
 
     buffer = io.BytesIO()
@@ -242,9 +241,9 @@ def new_folder(path: Path) -> Iterator[Path]:
         new.mkdir()
         with at_the_end(lambda: shutil.rmtree(temporary, ignore_errors=True)):
             yield new
-        refuse_special(path, "a folder")  # again: filling it may have taken long
+        refuse_special(path, "a folder")  # again, since filling it may have taken long
         with _named(path):
-            # A folder cannot be replaced in one step: the old one steps aside first, and for an instant there is none.
+            # A folder cannot be replaced in one step: the old one is moved away first.
             if path.exists():
                 os.replace(path, temporary / "old")
             os.replace(new, path)

@@ -1,4 +1,4 @@
-"""What the experiments on logs of really commanded servos share: fits and evaluations through the commands alone."""
+"""Functions of the experiments on logs of commanded servos: fits and evaluations with the program's commands."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 
 
 def kept(recordings: Sequence[Recording], folder: Path) -> dict[str, Path]:
-    """The recordings as files, by name."""
+    """Write the recordings as files; returns the paths by name."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {r.name: folder / f"{r.name}.npz" for r in recordings}
     for recording in recordings:
@@ -28,7 +28,7 @@ def kept(recordings: Sequence[Recording], folder: Path) -> dict[str, Path]:
 
 
 def command(words: Sequence[str | Path]) -> None:
-    """One command of `python -m droid_jax.run`; ValueError where it fails."""
+    """Run a command of `python -m droid_jax.run`; ValueError where it fails."""
     if code := main([str(word) for word in words]):
         raise ValueError(f"`{' '.join(map(str, words[:1]))}` ended with exit code {code}")
 
@@ -36,11 +36,11 @@ def command(words: Sequence[str | Path]) -> None:
 def fitted(
     scene: Path, parameters: Path, fit: Sequence[Path], judge: Sequence[Path], out: Path, options: Sequence[str | Path]
 ) -> tuple[dict[str, Any], float]:
-    """fit.json of an identification, and the seconds that it took; one that is finished already is read."""
+    """fit.json of an identification and its seconds; a finished run is read, not repeated."""
     began = time.monotonic()
     command(
-        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--judge-on", *judge, *options,
-         "--out", out]
+        ["identify", "--scene", scene, "--parameters", parameters, "--recording", *fit, "--test-recording", *judge,
+         *options, "--out", out]
     )  # fmt: skip
     assert (out / CONFIG).is_file()
     found = json.loads((out / FIT).read_text())

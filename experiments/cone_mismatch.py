@@ -1,11 +1,11 @@
-"""What does the search say where the robot's friction cone is another than the simulation's, and nothing is hidden?
+"""Does the search raise false alarms if the robot's friction cone differs from the simulation's and nothing is hidden?
 
     python experiments/cone_mismatch.py [--quick] [--out DIR] [--cases 4] [--commit HASH]
 
-The synthetic robot's contacts get MuJoCo's elliptic cone; the simulation keeps its pyramid.  First the torques'
-difference of
-one robot with either cone, then the whole search on robots of the blind suite's nulls.  One small JSON a case under
-OUT/cone_cases: the run can be stopped and goes on where it was.  --quick leaves the searches out.
+The synthetic robot's contacts get MuJoCo's elliptic cone; the simulation keeps its pyramid.  First the torques of one
+robot with either cone are compared.  Then the whole search is run on robots of the blind suite without hidden effects.
+One JSON file per case is written under OUT/cone_cases, so that a stopped run can be continued.  --quick omits the
+searches.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Arguments:
     """Options."""
 
     quick: bool = False
-    """The torques' difference alone."""
+    """Only compare torques."""
     cases: int = 4
-    """Robots that are searched."""
+    """Number of robots to search."""
     commit: str = "HEAD"
     """Commit that froze the method: seeds derive from it."""
     out: Path = ROOT / "runs" / "cone_mismatch"
@@ -73,7 +73,7 @@ def robot(where: Setting, number: int, seed: int) -> tuple[int, Drawn, dict[str,
 
 
 def between_cones(where: Setting, seed: int) -> list[float]:
-    """Joint by joint the root mean square [N m] of what the cone alone changes: one robot, the same noise.
+    """Root mean square [N m] of each joint's torque difference between the cones, for one robot with the same noise.
 
     The first robot that is searched, which keeps hold of its door with elliptic contacts.
     """

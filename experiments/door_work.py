@@ -1,9 +1,9 @@
-"""How much of the arm's work goes into the door?  The reason why Table II cannot tell its methods apart.
+"""What share of the arm's work goes into the door?  A small share is why Table II cannot distinguish its methods.
 
     python experiments/door_work.py [--quick] [--out DIR] [--policies DIR]
 
 For the synthetic robot of each setting of Table II: the work of the arm's servos (actuator torque times joint motion,
-summed over the joints) and the work that the door takes.  In demonstrations A and C the door's work is what the hinge's
+summed over the joints) and the work done on the door.  In demonstrations A and C the door's work is what the hinge's
 friction loss and damping dissipate over the whole motion.  In the first trials of every policy of Table II it is what
 the pads do to the knob about the hinge until the door is open, its kinetic energy included.  Nothing is trained or
 fitted.  Writes DIR/door_work.json: for every motion and policy door_j, servo_j and share.
@@ -47,7 +47,7 @@ class Arguments:
     """Options of the experiment."""
 
     policies: Path = REPORTED
-    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
+    """Folder of the policies of table2.py; default: the reported ones in benchmarks/results/archive."""
     quick: bool = False
     """One setting, one motion, one short trial of one policy of each method: shows that it runs."""
     out: Path = RESULTS
@@ -55,7 +55,7 @@ class Arguments:
 
 
 def of_demonstration(setting: Setting, name: str) -> dict[str, float]:
-    """J of door and servos over one repeat of a demonstration, without sensor noise."""
+    """Work [J] on the door and of the servos over one repeat of a demonstration, without sensor noise."""
     truth, config = truth_of(setting), SyntheticRobotConfig(repeats=1)
     robot = set_up(
         door_scene(), load_recording(demonstration_path(name)), truth, seed=100 * setting.robot, config=config

@@ -1,13 +1,13 @@
-"""Which missing effects does a policy notice?  One policy that knows of none, on robots that hide one each.
+"""Which missing effects impair a policy?  One policy trained without effects, on robots that hide one effect each.
 
     python experiments/effects_on_policy.py [--quick] [--out DIR] [--springs 0] [--trials 12]
     python experiments/effects_on_policy.py --policy runs/train/policy.npz --hide closer=2 payload=0.5 --out runs/felt
 
 A policy is trained on draws of the prior, unless one is given.  Then the synthetic robot hides each effect of the blind
-suite in turn, at the largest amplitude that is usual and at three times that, and the policy is tried on it; and it is
-asked whether the demonstration still holds its grasp there, for what cannot be recorded cannot be searched either.
-A pilot: robot and seeds are others than those of the runs that are reported; hidden_effect_policy.py's effect was
-chosen with it.  DIR/effects_on_policy_robot_100_from_100.json is the table.
+suite in turn, at its largest usual amplitude and at three times that, and the policy is tried on it.  The experiment
+also checks whether the demonstration keeps its grasp on that robot, since a search needs its recording.  This is a
+pilot: its robot and seeds differ from those of the reported runs.  The effect of hidden_effect_policy.py was chosen
+with it.  DIR/effects_on_policy_robot_100_from_100.json is the table.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Arguments(Options):
     springs: int = 0
     """The synthetic robot's column of Table I."""
     policy: Path | None = None
-    """A policy.npz of any run, instead of one that is trained."""
+    """A policy.npz of any run, instead of training one."""
     hide: tuple[str, ...] = ()
     """name=amplitude or name[joint]=amplitude; default: every effect that a policy can be tried with."""
     first: int = PILOT
@@ -75,7 +75,7 @@ class Arguments(Options):
 
 
 def applicable(scene: Scene, arguments: Arguments) -> list[Applied]:
-    """What is asked for, or every effect that a policy can be tried with, on the hinge too where it can act there."""
+    """The effects asked for, or all that a policy can be tried with, also on the hinge where possible."""
     if arguments.hide:
         return [one for entry in arguments.hide for one in as_applied(hidden_effects([entry], scene))]
     found = []
@@ -100,7 +100,7 @@ def recordable(scene: Scene, setting: Setting, hidden: Sequence[Applied]) -> boo
 
 
 def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> Iterator[dict[str, Any]]:
-    """What the policy does with nothing hidden, and with each effect."""
+    """Results of the policy without a hidden effect and with each effect."""
     scene, demonstrated = door_scene(limits=True), door_scene(timestep=TIMESTEP)
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
     config = TransferConfig(trials=arguments.trials, seed=setting.robot)
@@ -127,7 +127,7 @@ def rows(policy: Policy, setting: Setting, task: Task, arguments: Arguments) -> 
 
 
 def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> Path:
-    """File of a policy of the prior; made where there is none yet."""
+    """File of a policy trained on the prior; trains one where there is none yet."""
     folder, budget, seed = arguments.cases("effects_on_policy"), arguments.budget, arguments.first
     task = asdict(budget.task(Task(**setting.task)))
     of = {"setting": asdict(setting), "task": task, "seed": seed, "budget": budget.to_json()}
@@ -142,7 +142,7 @@ def trained(arguments: Arguments, setting: Setting, code: Mapping[str, Any]) -> 
 
 
 def needs_out(arguments: Arguments) -> None:
-    """Ends the program where another policy's or other effects' table would be written over the pilot's."""
+    """Ends the program where the table of another policy or other effects would overwrite that of the pilot."""
     if (arguments.policy or arguments.hide) and not arguments.quick and arguments.out == RESULTS:
         raise SystemExit("error: --policy and --hide make another table than the one that is kept: give --out DIR")
 

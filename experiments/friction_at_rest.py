@@ -1,4 +1,4 @@
-"""Dry friction at rest: does a log with nothing missing get its values right, and no false name?
+"""Dry friction at rest: are values right and no effects named falsely in logs with nothing missing?
 
     python experiments/friction_at_rest.py --out DIR            # 100 seeds; about an hour on two cores
     python experiments/friction_at_rest.py --out DIR --quick    # two seeds
@@ -6,8 +6,8 @@
 Each seed draws a hinge with gravity and dry friction of 0.02 to 0.5 N m that moves, reverses and holds, and records
 two logs of 60 s without commands.  Even seeds integrate the set-valued law of friction exactly (Moreau's time stepping,
 written here, no MuJoCo); odd ones are plain C MuJoCo, whose soft friction creeps where it should hold.  `identify` fits
-damping, friction and armature to the first log, `find_missing_effects` searches both.  One JSON a seed under
-OUT/seeds: the run goes on after a stop, and the same command started twice shares the seeds.
+damping, friction and armature to the first log, `find_missing_effects` searches both.  One JSON file
+per seed is written under OUT/seeds.  A stopped run can be continued, and several processes can share the seeds.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class Arguments:
     quick: bool = False
     """Two seeds."""
     seeds: int = 100
-    """How many."""
+    """Number of seeds."""
     first: int = 0
-    """The first of them."""
+    """The first seed."""
     sum_only: bool = False
-    """Sum up the seeds that are there."""
+    """Run nothing; summarise the existing seeds."""
     out: Path = ROOT / "runs" / "friction_at_rest"
     """Folder of the seeds and of friction_at_rest.json."""
 
@@ -89,7 +89,7 @@ def drawn(rng: np.random.Generator) -> Truth:
 
 
 def commanded(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
-    """[T] rad: two slow sines, held for a while now and then."""
+    """Command [T] rad: two slow sines with pauses."""
     moving = np.ones_like(time)
     for start in rng.uniform(0, SECONDS, 6):
         moving *= 1.0 - (np.abs(time - start) < rng.uniform(0.5, 1.5))
@@ -102,7 +102,7 @@ def commanded(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
 def exact(truth: Truth, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T] rad and servo torques [T] N m at STEP: the set-valued law by Moreau's time stepping.
 
-    The friction of a step is what would stop the joint, within its bounds: a joint that can be held stands still.
+    The friction of a step is the torque that would stop the joint, limited to the friction loss.
     """
     inertia = truth.armature + MASS * LENGTH**2 + 1e-5
     q, v = command[0], 0.0
@@ -118,7 +118,7 @@ def exact(truth: Truth, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_mujoco(truth: Truth, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same by plain C MuJoCo at STEP, with its default, soft friction constraint."""
+    """Positions [T] rad and servo torques [T] N m by plain C MuJoCo at STEP, with its default soft friction."""
     model = mujoco.MjModel.from_xml_string(model_xml(truth, STEP))
     data = mujoco.MjData(model)
     data.qpos[0] = command[0]
@@ -160,7 +160,7 @@ def recorded(seed: int, name: str) -> tuple[Recording, Truth]:
 
 
 def studied() -> tuple[Scene, Space]:
-    """The model that is fitted: nominal values of its own, none of them a truth."""
+    """The model that is fitted, with nominal values that differ from the true ones."""
     scene = compile_scene(mujoco.MjSpec.from_string(model_xml(Truth(0.05, 0.05, 0.01), 0.002)), name="stick")
     return scene, Space(
         (
@@ -172,9 +172,9 @@ def studied() -> tuple[Scene, Space]:
 
 
 def one(seed: int, scene: Scene, space: Space) -> dict[str, Any]:
-    """What a seed's two logs say."""
+    """Fit and search of a seed's two logs."""
     (first, truth), (second, _) = recorded(seed, "a"), recorded(seed, "b")
-    # Inverse dynamics is smooth in these parameters: a short search will do, the refinement does the rest.
+    # Inverse dynamics is smooth in these parameters: a short search before the refinement is enough.
     config = IdentifyConfig(search=CmaConfig(population=16, generations=8))
     found = identify_parameters(scene, space, [first], config=config)
     low, high = found.full_gaussian.interval(LEVEL)
@@ -209,7 +209,7 @@ def summary(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main(arguments: Arguments) -> None:
-    """Make the seeds that are not there yet, and sum up."""
+    """Run the seeds that have no result yet, and summarise all."""
     folder = arguments.out / "seeds"
     scene, space = studied()
     for seed in range(arguments.first, arguments.first + (2 if arguments.quick else arguments.seeds)):

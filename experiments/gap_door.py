@@ -1,21 +1,22 @@
-"""What does a real self-closing cabinet door have beside friction?
+"""Which effects beside constant friction does a real self-closing cabinet door show?
 
     python experiments/gap_door.py --data DIR            # minutes on two cores, most of it false alarms
     python experiments/gap_door.py --data DIR --quick    # does it all work?
 
 Two logs of a robot that pulls one cabinet door open, 0 to 90 degrees, with the force at its wrist.  The base model is
-constant friction; one log is fitted, the other judges.  The tangential force times the radius is the hinge's torque.
+constant friction.  One log is fitted; the other is the test data.  The tangential force times the radius is the hinge's
+torque.
 
-The logs hold no time, and their authors' order of samples is no clock.  So the angle is the clock: the torque is put
-on a regular grid of angles that is passed at one slow speed.  Inertia is nil, speed is the same throughout, and
-effects of speed (drag, closer, check, Stribeck) and of time (drift, delay) are not asked about: nothing in these
-logs could tell them from what depends on the angle.  Nor can friction be told from a spring, as the door only
-opens: friction that changes with the angle belongs to every answer that a spring belongs to.
+The logs hold no time, and their samples have no regular order in time.  The angle is therefore used as the clock: the
+torque is interpolated to a regular grid of angles that is passed at one slow speed.  Inertia is zero and the speed
+constant.  Effects of speed (drag, closer, check, Stribeck) and of time (drift, delay) are not among the candidates,
+because these logs cannot distinguish them from effects of the angle.  Friction cannot be distinguished from a spring
+either, because the door only opens: wherever a spring is an answer, angle-dependent friction is another.
 
-Left out are the first 5 degrees, in which the hook seats itself.
+The first 5 degrees, in which the hook seats itself, are left out.
 
-Known effects are added to constant friction and to what the answer leaves of the real log: beside the real spring,
-which is as smooth, one opening could not show another.
+In the controls, known effects are added to constant friction and the residuals of the answer.  They are not added to
+the real spring: it is as smooth, and one opening could not distinguish the two.
 
 Data: A. Jain, C. C. Kemp, Georgia Tech, 2011; github.com/gt-ros-pkg/hrl,
 advait_sandbox/hrl_pr2_door_opening/src/hrl_pr2_door_opening/pkls, converted to npz.  DIR holds ikea_cabinet_log.npz
@@ -82,7 +83,7 @@ class GapDoor:
 
     data: folder with ikea_cabinet_log.npz and ikea_cabinet_2.npz.
     out: folder for gap_door.json.
-    quick: five synthetic logs; its false alarms are not for keeping.
+    quick: five synthetic logs, too few to report false alarms.
     cases: synthetic logs with nothing missing.
     seed: of flips, resamples and synthetic logs.
     """
@@ -119,7 +120,7 @@ def load_door(folder: Path, name: str) -> tuple[Recording, float]:
 
 
 def forces(search: Search, verdict: Verdict, radii: Mapping[str, float]) -> dict[str, Any]:
-    """RMS of the tangential force [N] that constant friction and the answer leave, on both logs."""
+    """RMS residual of the tangential force [N] with constant friction and with the answer, on both logs."""
     assert search.sealed is not None
     out = {}
     for name, log in ((FIT, search.log), (JUDGE, search.sealed)):
@@ -129,7 +130,7 @@ def forces(search: Search, verdict: Verdict, radii: Mapping[str, float]) -> dict
 
 
 def with_known(springs: Sequence[Effect], search: Callable[[Sequence[Effect]], Search]) -> dict[str, Any] | None:
-    """What is said with the springs that were named in the base model; None where none was, and nothing is asked."""
+    """The search with the named springs in the base model; None where no spring was named."""
     return answer(search([as_known(e) for e in springs])) if springs else None
 
 

@@ -1,15 +1,16 @@
-"""What does a carriage on its slide lack that knows only mass and viscous friction?  The real EMPS axis.
+"""What does a model of the real EMPS axis lack that has only mass, viscous friction and an offset?
 
     python experiments/gap_emps.py --data DIR            # about half an hour on two cores, most of it false alarms
     python experiments/gap_emps.py --data DIR --quick    # does it all work?
 
-The base model is mass, viscous damping and a constant offset.  The published model has dry friction beside them
-(20.4 N), and a better one that differs between the directions, above all in its viscous part (167 and 240 N s/m).
-One log, no repeats: the search of `droid_jax.discrepancy.log_case` on the first two thirds of DATA_EMPS, judged on its
-last third and on DATA_EMPS_PULSES, another run.  Data and filter: see real_emps.py.
+The base model is mass, viscous damping and a constant offset.  The published model also has dry friction (20.4 N).  A
+better published model has friction that differs between the directions, above all its viscous part (167 and
+240 N s/m).  There is one log without repeats: the search of `droid_jax.discrepancy.log_case` runs on the first two
+thirds of DATA_EMPS.  Test data are its last third and another run, DATA_EMPS_PULSES.  Data and filter: see
+real_emps.py.
 
-The library has no viscous friction that differs between the directions.  `uneven_damping` below is such an effect
-of a user's own; it is asked about in a search of its own, and was written knowing what had been published.
+The library has no viscous friction that differs between the directions.  `uneven_damping` below is such an effect,
+written for this experiment in knowledge of the published model.  A separate search tests it.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class GapEmps:
 
     data: folder with DATA_EMPS.npz and DATA_EMPS_PULSES.npz.
     out: folder for gap_emps.json.
-    quick: three synthetic logs; its false alarms are not for keeping.
+    quick: three synthetic logs, too few to report false alarms.
     cases: synthetic logs with nothing missing.
     seed: of flips, resamples and synthetic logs.
     """
@@ -101,7 +102,7 @@ def uneven_damping(scene: Scene) -> Effect:
 
 
 def searches(config: GapEmps, scene: Scene) -> dict[str, Search]:
-    """By what the base has and what is asked about."""
+    """The searches by name, each with its base model and candidates."""
     recording, gap = load_emps(config.data, FIT), settings(MOTION_CUTOFF, config.seed)
     effects = {e.name: e for e in library(scene, scale=NEWTONS) if e.name not in NOT_ASKED}
     known = [as_known(effects["joint_coulomb"])]

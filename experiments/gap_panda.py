@@ -1,17 +1,18 @@
-"""What do a real Panda's joints lack that are rigid bodies with viscous friction only?
+"""What does a model of a real Panda lack that has only rigid bodies, viscous friction and offsets?
 
     python experiments/gap_panda.py --data DIR            # about an hour on two cores, most of it false alarms
     python experiments/gap_panda.py --data DIR --quick    # does it all work?
 
 The base model is the bare arm: link masses (3 %) and centres of mass (5 mm) as nuisances, viscous friction and a
-constant offset in every joint.  Published for this very log is dry friction in every joint.  One log, no repeats: the
-search of `discrepancy.log_case` on the first two thirds, judged on the last, which repeats a motion that was fitted.
+constant offset in every joint.  Dry friction in every joint is published for this log.  There is one log without
+repeats: the search of `discrepancy.log_case` runs on the first two thirds.  The last third, which repeats a fitted
+motion, is the test data.
 
-Each joint's friction is a seventh of what is missing, and no seventh takes a fifth of the gap, which an effect must.
-So every effect of a joint is also asked about in all joints at once, as one candidate with an amplitude for each; in
-which joints it is, their intervals say.
+Friction in one joint is about a seventh of what is missing, and an effect must explain a fifth of the gap.  Every
+effect of a joint is therefore also a candidate in all joints at once, with an amplitude for each joint.  The intervals
+of the amplitudes show in which joints it is present.
 
-Joint 2: its residual is gravity and inertia before it is friction.  What the search must do is to leave it open.
+The residual of joint 2 is mostly gravity and inertia, not friction: the search should leave it unexplained.
 Data and filter: see real_panda.py.
 """
 
@@ -67,7 +68,7 @@ class GapPanda:
 
     data: folder with panda_exciting_traj1.npz and reference_values.json.
     out: folder for gap_panda.json.
-    quick: no controls and two synthetic logs; its false alarms are not for keeping.
+    quick: no controls and two synthetic logs, too few to report false alarms.
     cases: synthetic logs with nothing missing.
     seed: of flips, resamples and synthetic logs.
     """
@@ -86,7 +87,7 @@ def base_space(scene: Scene) -> Space:
 
 
 def asked_about(scene: Scene, recording: Recording) -> list[Effect]:
-    """What the log can show of the library, joint by joint and in all joints at once."""
+    """The effects of the library that the log can show, joint by joint and in all joints at once."""
     return [_everywhere(e) for e in observable_effects(scene, [recording]) if e.name not in NOT_ASKED]
 
 
@@ -98,7 +99,7 @@ def _everywhere(effect: Effect) -> Effect:
 
 
 def by_joint(found: Mapping[str, Any], published: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    """Dry friction of each joint beside the published values, and how much of the torque error is left there."""
+    """Dry friction of each joint beside the published value, and the remaining share of the torque error."""
     values, sealed = found["values"], found["rms"]["test"]
     out = []
     for j, joint in enumerate(ARM):

@@ -1,13 +1,13 @@
-"""What the gap searches in single real logs share: the search, its controls, its false alarms, its report.
+"""Functions of the gap searches in single real logs: the search, its controls, its false alarms, its report.
 
 Every experiment answers four questions about its log:
 
-1. What is missing in the model that a person would start from?
-2. Control: with that in the model, is it named again?  (It must not be.)
-3. Control: is a known effect found that is added to the real measurement?  The measured torque is raised by
-   what the effect adds to the simulation; everything real stays in the residual.
-4. False alarms: synthetic logs of the real motion, torques of the fitted base model and coloured noise fitted to the
-   real residual, nothing missing.  In how many is something said to be missing, and in how many named?
+1. What is missing in the base model?
+2. Control: with that effect in the model, is it named again?  (It must not be.)
+3. Control: is a known effect found that is added to the real measurement?  The torque that the effect adds to the
+   simulation is added to the measured torque; the real residual stays.
+4. False alarms: synthetic logs of the real motion with nothing missing, with torques of the fitted base model and
+   coloured noise fitted to the real residual.  In how many is something found to be missing, and in how many named?
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ BURN = 400  # samples before the noise is stationary
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """A log, the model one starts from, and what may be missing in it.
+    """A log, the base model, and the effects that may be missing in it.
 
-    sealed: another log, or None.  base: with the parameters of `known`, the effects that the base has.
+    sealed: another log as test data, or None.
+    base: parameters of the base model, including those of `known`, the effects that it has.
     """
 
     log: LoneLog
@@ -74,7 +75,7 @@ class Search:
 
 
 def settings(motion_cutoff: float, seed: int) -> DiscrepancyConfig:
-    """Inverse dynamics is smooth in its parameters: no search and no hops before the refinement."""
+    """Settings without a search before the refinement: inverse dynamics is smooth in its parameters."""
     return DiscrepancyConfig(
         refine=RefineConfig(iterations=12, basin_hops=0, spreads=0),
         compare=CompareConfig(whitened=True, motion_cutoff=motion_cutoff),
@@ -106,7 +107,7 @@ def run_search(search: Search, log: LoneLog | None = None, start: np.ndarray | N
 
 
 def answer(search: Search, log: LoneLog | None = None) -> dict[str, Any]:
-    """The report of a search, or why none was possible: nothing is said then."""
+    """The report of a search, or the reason why the search was refused."""
     try:
         return report(*run_search(search, log))
     except ValueError as error:
@@ -115,7 +116,7 @@ def answer(search: Search, log: LoneLog | None = None) -> dict[str, Any]:
 
 
 def as_known(effect: Effect) -> Effect:
-    """The same physics under parameters `known_...`, for a base that has it while it is asked about once more."""
+    """The same effect with parameters `known_...`, for a base model that has it while it is a candidate again."""
 
     def own(theta: Theta) -> Theta:
         return {p.name: theta[f"known_{p.name}"] for p in effect.parameters}
@@ -133,7 +134,7 @@ def as_known(effect: Effect) -> Effect:
 
 
 def adding(log: LoneLog, values: np.ndarray, added: Mapping[str, float]) -> LoneLog:
-    """The log with what parameters `added` change in the simulation at `values` [D] added to its measurement."""
+    """The log plus the change of the simulation by the parameters `added`, at `values` [D]."""
     without, with_it = log.simulated(np.stack([values, _changed(log, values, added)]))
     return log.with_torques(log.measured + with_it - without)
 
@@ -164,8 +165,8 @@ def coloured(residuals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder: Path) -> dict[str, Any]:
     """The whole search on `count` synthetic logs in which nothing is missing; shares are of those not refused.
 
-    Torques of the fitted base model; noise like what the extended model leaves of the real log.
-    folder: what is said of each log is kept there, so that a run that was stopped goes on where it was.
+    Torques are those of the fitted base model; the noise is like the residuals of the extended model in the real log.
+    folder: the result of each log is kept there, so that a stopped run can be continued.
     """
     rng = np.random.default_rng(seed)
     truth, left = verdict.base.values, search.log.residual(verdict.model.values)
@@ -193,7 +194,7 @@ def false_alarms(search: Search, verdict: Verdict, count: int, seed: int, folder
 
 
 def _said_of(search: Search, log: LoneLog, start: np.ndarray) -> dict[str, Any]:
-    """What a search says of a log: p, verdict, effects, blocks; or why it says nothing."""
+    """Result of a search in a log: p, verdict, effects, blocks; or why it was refused."""
     try:
         case, found = run_search(search, log, start)
     except ValueError as error:  # too short for the residual's correlation time
@@ -204,12 +205,12 @@ def _said_of(search: Search, log: LoneLog, start: np.ndarray) -> dict[str, Any]:
 
 
 def _key(log: LoneLog, code: str) -> str:
-    """Of a log's torques and the program's commit: what is kept under it was said of this log by this program."""
+    """Key of a kept result: hash of the log's torques and the program's commit."""
     return hashlib.sha256(np.ascontiguousarray(log.measured).tobytes() + code.encode()).hexdigest()[:12]
 
 
 def share(hits: int, count: int) -> dict[str, Any]:
-    """Hits, their share and its 95 % interval; of nothing, all is possible."""
+    """Hits, their share and its 95 % interval, which is 0 to 1 without cases."""
     if count == 0:
         return {"hits": 0, "share": None, "interval": [0.0, 1.0]}
     return {"hits": hits, "share": round(hits / count, 4), "interval": rounded(wilson(hits, count))}
@@ -269,14 +270,14 @@ def _rms_of(case: Case, verdict: Verdict, role: str) -> dict[str, list[float]]:
 
 
 def show(title: str, found: Mapping[str, Any]) -> None:
-    """A few lines for people."""
+    """Print a few lines about the result."""
     print(f"{title}: {found['sentence']}  (p {', '.join(f'{p:.2g}' for p in found['p'])})", flush=True)
     for role, r in found["rms"].items():
         print(f"  {role:8s} RMS {r['before']} -> {r['after']}", flush=True)
 
 
 def names_one_of(found: Mapping[str, Any], names: Sequence[str]) -> bool | None:
-    """Whether one of some effects is named, be it in a tie; None where the search was refused and says nothing."""
+    """Whether one of some effects is named, possibly as indistinguishable; None where the search was refused."""
     if found["verdict"] == "refused":
         return None
     said = [*found["effects"], *(n for t in found["indistinguishable"] for n in t)]
@@ -284,6 +285,6 @@ def names_one_of(found: Mapping[str, Any], names: Sequence[str]) -> bool | None:
 
 
 def silent_about(found: Mapping[str, Any], names: Sequence[str]) -> bool | None:
-    """Whether none of them is; None where the search was refused."""
+    """Whether none of the effects is named; None where the search was refused."""
     named = names_one_of(found, names)
     return None if named is None else not named

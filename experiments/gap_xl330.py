@@ -1,10 +1,10 @@
-"""What does a real servo lack, from positions alone?  Its logs at two gains are searched, those of the third judge.
+"""What does a real servo's model lack, by positions alone?  Two gains are searched, the third is the test.
 
     python experiments/gap_xl330.py --data DIR
 
 `gap` searches logs of a Dynamixel XL330 with a pendulum (`xl330.xml`), started from Coulomb and viscous friction
-(`xl330.json`), by windows.  Its authors' models have friction that grows with the load.  Three folds: each gain judges
-once.  Data as in `real_xl330.py`.
+(`xl330.json`), by windows.  Its authors' models have friction that grows with the load.  There are three
+folds: each gain is the test data once.  Data as in `real_xl330.py`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class GapXl330:
     """Search a real servo's logs for what the model lacks.
 
     data: folder with the logs.
-    quick: one fold and two motions; its numbers are not for keeping.
-    judges: gains that judge, one a fold.
+    quick: one fold and two motions; its numbers are not to be reported.
+    judges: gains of the test data, one per fold.
     out: folder for gap_xl330.json, and for the runs below `gap_xl330_runs`.
     seed: of the searches.
     """
@@ -51,7 +51,7 @@ def fold(config: GapXl330, paths: dict[str, Path], judge: int, motions: tuple[st
     began = time.monotonic()
     command(
         ["gap", "--scene", HERE / "xl330.xml", "--parameters", HERE / "xl330.json", "--recording", *train,
-         "--judge-on", *test, "--seed", str(config.seed), "--out", out]
+         "--test-recording", *test, "--seed", str(config.seed), "--out", out]
     )  # fmt: skip
     found = json.loads((out / GAP).read_text())
     return {
@@ -74,7 +74,7 @@ def fold(config: GapXl330, paths: dict[str, Path], judge: int, motions: tuple[st
 
 
 def main(config: GapXl330) -> None:
-    """A fold for each gain that judges, and one line of JSON."""
+    """Run a fold for each test gain; prints one line of JSON."""
     motions = MOTIONS[:1] + MOTIONS[2:3] if config.quick else MOTIONS
     judges = config.judges[:1] if config.quick else config.judges
     logs = [xl330_log(config.data, motion, gain) for motion in motions for gain in GAINS]

@@ -1,12 +1,12 @@
-"""Does it pay to find a missing effect?  Policies trained on the prior, on the base fit, and on the extended model.
+"""Does a policy gain from finding a missing effect? Policies trained on the prior, the base fit and the extended model.
 
     python experiments/hidden_effect_policy.py [--quick] [--out DIR] [--hide magnetic_catch=12] [--seeds 5]
 
 The synthetic robot hides an effect.  It is recorded in three motions and searched once (`gap`); the verdict, right or
-wrong, is taken as it comes.  Then policies are trained on draws of the base model's Gaussian, of the extended model's
-and of the prior, alike in everything else, and tried on the robot that hides the effect.  Where the search names no
-effect, there is nothing to compare.  Every policy is one JSON file under DIR/hidden_effect_cases and is not trained
-again; DIR/hidden_effect_policy.json sums them up.
+wrong, is used unchanged.  Then policies are trained on draws of the base model's Gaussian, of the extended model's
+and of the prior, with all else equal, and tried on the robot that hides the effect.  Where the search names no
+effect, nothing is compared.  Every policy is one JSON file under DIR/hidden_effect_cases and is not trained
+again; DIR/hidden_effect_policy.json summarises them.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Arguments(Options):
     """Options of the experiment."""
 
     hide: tuple[str, ...] = ("magnetic_catch=12",)
-    """What the synthetic robot hides, name=amplitude."""
+    """Effect that the synthetic robot hides, name=amplitude."""
     steps_allowed: int = 512
     """Actions of an episode."""
 
@@ -88,7 +88,7 @@ class Arguments(Options):
 def search(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> dict[str, Any]:
     """The verdict on the robot that hides an effect; base.json and extended.json are in the folder then.
 
-    A search that was stopped goes on with the same code only: what other code left half-done is not taken.
+    A stopped search is continued only by the same code.
     """
     with claimed(folder / "verdict.json", wait=True):
         return _searched(arguments, folder, code)
@@ -136,7 +136,7 @@ def _searched(arguments: Arguments, folder: Path, code: Mapping[str, Any]) -> di
 
 
 def playable(arguments: Arguments) -> None:
-    """Ends the program where no policy can be tried with what is hidden: before the search, which takes hours."""
+    """Ends the program, before the search of hours, where no policy can be tried with the hidden effect."""
     scene = door_scene()
     try:
         check_playable(scene, as_applied(hidden_effects(arguments.hide, scene)))
@@ -145,7 +145,7 @@ def playable(arguments: Arguments) -> None:
 
 
 def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mapping[str, Any]) -> dict[str, Any]:
-    """One policy, trained on the prior or on one of the two models that the search left in the folder.
+    """One policy, trained on the prior or on one of the two models that the search wrote to the folder.
 
     All three are over the parameters and nuisances of the search, the extended model's over its effects too.
     """
@@ -165,7 +165,7 @@ def case(model: str, seed: int, folder: Path, arguments: Arguments, code: Mappin
 
 
 def planned_case(model: str, seed: int, arguments: Arguments, code: Mapping[str, Any]) -> Case:
-    """A policy of a model, and what its file must say."""
+    """A policy of a model, and the content that its file must have."""
     folder = arguments.cases("hidden_effect")
     of = {
         "model": model,

@@ -1,13 +1,13 @@
-"""The blind suite: does the search for a missing effect find what was hidden, and nothing where nothing was?
+"""The blind suite: does the search find the hidden effect, and nothing where nothing is hidden?
 
     python experiments/hidden_effects.py limits --scenes hinge bench   # once, before the method is frozen
     python experiments/hidden_effects.py make --scenes hinge bench     # recordings and, elsewhere, the truth
-    python experiments/hidden_effects.py search                        # sees recordings only; goes on after a stop
-    python experiments/hidden_effects.py oracle                        # what the right names could reach
+    python experiments/hidden_effects.py search                        # sees recordings only; can be continued
+    python experiments/hidden_effects.py oracle                        # the best result that the right names allow
     python experiments/hidden_effects.py score                         # opens the seals
     python experiments/hidden_effects.py all --quick                   # make, search and score a few cases
 
-The package `blind` says how it is kept honest.  Each command ends with one line of JSON.
+The package `blind` describes how the search is kept blind.  Each command ends with one line of JSON.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ QUICK_EFFECTS = ("hinge_preload",)
 
 @dataclass(frozen=True)
 class Limits:
-    """Detection limits of every hidden effect, by scene; what the file holds of other scenes stays."""
+    """Compute detection limits of every hidden effect, by scene; entries of other scenes stay in the file."""
 
     scenes: tuple[SceneName, ...] = ("hinge", "bench")
     """Scenes."""
@@ -59,16 +59,16 @@ class Limits:
     draws: int = 3
     """Robots drawn; the median of their limits counts."""
     out: Path = LIMITS
-    """The file."""
+    """File for the limits."""
     kept: Path = RUNS / "limits"
-    """Folder of what is known so far of each robot: a run that was stopped goes on."""
+    """Folder of the results so far, from which a stopped run is continued."""
     quick: bool = False
-    """One robot, one effect; into a file of its own."""
+    """One robot, one effect; writes another file."""
 
 
 @dataclass(frozen=True)
 class Make:
-    """Record cases: what the search may see goes to OUT/cases, the truth to OUT/sealed."""
+    """Record cases: recordings for the search go to OUT/cases, the truth to OUT/sealed."""
 
     scenes: tuple[SceneName, ...] = ("hinge", "bench")
     """Scenes."""
@@ -87,9 +87,9 @@ class Make:
     out: Path = RUNS
     """Folder of cases and seals."""
     unsearched: bool = False
-    """Only cases without a file in OUT/results: a run that goes on elsewhere needs no others."""
+    """Only cases without a file in OUT/results, to continue a run elsewhere."""
     quick: bool = False
-    """The lone hinge: nothing, and a preload.  Without --out in a folder beside the full run's, *_quick."""
+    """The lone hinge, without a hidden effect and with a preload.  The default folder ends with _quick."""
 
 
 @dataclass(frozen=True)
@@ -101,19 +101,19 @@ class Search:
     scenes: tuple[SceneName, ...] = ()
     """Only cases of these scenes."""
     at_most: int = 1000000
-    """Stop after so many."""
+    """Stop after this number of cases."""
     results: Path | None = None
-    """Folder of what is found, a file a case; default: `results` beside the folder that holds the case's folder."""
+    """Folder of the results, one file per case; default: `results` beside the folder of the cases."""
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """Fit the library's forms of what was hidden from the truth: what a search could reach at best."""
+    """Fit the library's form of the hidden effect, starting from the truth: the best possible result of a search."""
 
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names of cases; default: all in OUT/cases."""
     out: Path = RUNS
-    """Folder of cases and seals; what is found goes to `oracle` beside them."""
+    """Folder of cases and seals; results go to its subfolder `oracle`."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Score:
     out: Path = RUNS
     """Folder of cases and seals."""
     limits: Path = LIMITS
-    """Detection limits, for what a hidden amplitude is in the library's terms."""
+    """Detection limits, which convert a hidden amplitude to that of the library's effect."""
     results: Path | None = None
     """Folder of hidden_effects.json and of its table, hidden_effects.md; default: OUT."""
 

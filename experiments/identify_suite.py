@@ -1,10 +1,9 @@
-"""What identification reaches on the synthetic robot: doors of Table I, calibration, second arm pose, C parity.
+"""Identification on the synthetic robot: doors of Table I, calibration of intervals, second arm pose, C parity.
 
     python experiments/identify_suite.py [--quick] [--out DIR] [--parts doors calibration pose parity]
 
-Every case is one JSON file under DIR/identify_cases/ and is not run again, so the suite can be
-stopped and goes on where it was.  DIR/identify.json sums them up.  Truths and seeds of a case
-derive from its number alone.
+Every case is one JSON file under DIR/identify_cases/ and is not run again, so that a stopped suite can be continued.
+DIR/identify.json summarises them.  Truth and seeds of a case derive from its number alone.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Arguments:
     """Options of the suite."""
 
     quick: bool = False
-    """One case of each part (of the poses both) with a small budget: shows that it runs, says nothing about quality."""
+    """One case of each part (both poses) with a small budget: shows that it runs; its numbers mean nothing."""
     out: Path = ROOT / "benchmarks" / "results"
     """Folder of identify.json and of the cases."""
     parts: tuple[Part, ...] = ("doors", "calibration", "pose", "parity")
@@ -78,20 +77,20 @@ def recordings(scene: Scene, truth: dict[str, float], names: str, seed: int) -> 
 
 
 def describe(found: Identified, truth: dict[str, float]) -> dict[str, Any]:
-    """A case's figures: gap closed, every parameter with truth, interval and verdict.
+    """Figures of a case: share of the gap closed, and truth, interval and verdict of every parameter.
 
     search: mean and deviation in the coordinate in which the parameter was fitted, where it is normal.
     """
-    told = found.full_gaussian
-    low, high = told.interval(LEVEL)
-    assert told.coordinates == "search"
-    deviation = np.sqrt(np.diag(told.cov))
+    gaussian = found.full_gaussian
+    low, high = gaussian.interval(LEVEL)
+    assert gaussian.coordinates == "search"
+    deviation = np.sqrt(np.diag(gaussian.cov))
     parameters = {
         p.name: {
             "truth": truth[p.name],
             "best": float(found.best[i]),
             "interval": [float(low[i]), float(high[i])],
-            "search": [float(told.mean[i]), float(deviation[i])],
+            "search": [float(gaussian.mean[i]), float(deviation[i])],
             "inside": bool(low[i] <= truth[p.name] <= high[i]),
             "identifiable": found.identifiability[i].identifiable,
             "shrinkage": found.identifiability[i].shrinkage,
@@ -143,7 +142,7 @@ def door_case(springs: int, quick: bool) -> dict[str, Any]:
 def calibration_case(number: int, quick: bool) -> dict[str, Any]:
     """A random door: hinge log-uniform, the rest around Table I, nuisances on.
 
-    Doors whose grip fails on the synthetic robot are drawn again: a demonstration opens the door.
+    Doors whose grip fails on the synthetic robot are drawn again, since a demonstration must open the door.
     """
     scene = door_scene()
     space = door_space(scene)
@@ -196,7 +195,7 @@ def parity_case(seed: int, quick: bool) -> dict[str, Any]:
 
 
 def run_cases(arguments: Arguments) -> dict[str, dict[str, Any]]:
-    """Run what is missing of the chosen parts; returns all cases that there are, by name."""
+    """Run the missing cases of the chosen parts; returns all existing cases by name."""
     quick = arguments.quick
     cases: dict[str, tuple[int, Callable[[], dict[str, Any]]]] = {}  # name -> seed, and what makes it
     if "doors" in arguments.parts:
@@ -272,7 +271,9 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
         return {**counts, "coverage": None, "coverage_interval_95": None}
     rng = np.random.default_rng(0)
     drawn = ([known[i] for i in rng.integers(len(known), size=len(known))] for _ in range(2000))
-    draws = [np.mean(np.concatenate(doors)) for doors in drawn if any(doors)]  # doors that tell nothing have no share
+    draws = [
+        np.mean(np.concatenate(doors)) for doors in drawn if any(doors)
+    ]  # doors without identifiable parameters have no share
     return {
         **counts,
         "coverage": float(np.mean(np.concatenate(known))),
@@ -280,17 +281,17 @@ def _coverage(cases: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def both_tell(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
-    """Names of the parameters that both poses tell."""
+def identifiable_in_both(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    """Names of the parameters that are identifiable in both poses."""
     return [n for n, p in a.items() if not p["nuisance"] and p["identifiable"] and b[n]["identifiable"]]
 
 
 def agreement(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Do the two poses agree on what both tell?
+    """Agreement of the two poses on the parameters that are identifiable in both.
 
-    Their difference in the coordinate of the search, in units of its own deviation, is normal if so.
+    If they agree, their difference in the coordinate of the search, in units of its deviation, is normal.
     """
-    names = both_tell(a["parameters"], b["parameters"])
+    names = identifiable_in_both(a["parameters"], b["parameters"])
     apart = {}
     for name in names:
         (mean_a, std_a), (mean_b, std_b) = (case["parameters"][name]["search"] for case in (a, b))

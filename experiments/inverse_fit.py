@@ -1,7 +1,7 @@
-"""What the experiments on real logs share: filter, inverse-mode cost, fit, figures, results.
+"""Functions of the experiments on real logs: filter, inverse-mode cost, fit, figures, results.
 
-A log without commands is replayed in inverse mode: its measured motion is prescribed and the torque
-that this takes is compared with the measured one.  One filter chain, fixed beforehand:
+A log without commands is replayed in inverse mode: its measured motion is prescribed, and the torque that this motion
+needs is compared with the measured one.  The filters were fixed beforehand:
 
 1. Motion: the measured position, zero-phase Butterworth of order 4 at the experiment's cutoff, then
    central differences at the log's own rate (`droid_jax.simulate.measured_motion`).
@@ -52,7 +52,7 @@ LEVEL = 0.9  # of all intervals
 
 
 def read_npz(folder: Path, name: str, keys: Sequence[str], source: str) -> dict[str, np.ndarray]:
-    """Arrays of one npz file; FileNotFoundError or ValueError says what is missing and where it comes from."""
+    """Arrays of one npz file; the error for a missing file or array says where the data come from."""
     path = Path(folder) / name
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}; --data is the folder that holds it. {source}")
@@ -71,9 +71,9 @@ def read_npz(folder: Path, name: str, keys: Sequence[str], source: str) -> dict[
 
 
 def resampled(time: np.ndarray, values: np.ndarray, clock: np.ndarray) -> np.ndarray:
-    """[Tc, C] values [T, C] interpolated to a clock [Tc] s; rows that only repeat the one before are left out.
+    """Values [T, C] interpolated to a clock [Tc] s, as [Tc, C]; rows that repeat the previous row are left out.
 
-    A repeated row is a packet that did not arrive, not a robot that stood still for a millisecond.
+    A repeated row is a lost packet, not a robot that stood still for a millisecond.
     """
     fresh = np.r_[True, np.any(np.diff(values, axis=0) != 0, axis=1)]
     return interpolate(clock, time[fresh], values[fresh])
@@ -160,7 +160,7 @@ class Estimate:
 
 
 def find(cost: Cost, space: Space, config: CmaConfig) -> Fit:
-    """CMA-ES from the prior, the noise stated from what the prior's mean leaves unexplained."""
+    """CMA-ES from the prior; the noise is estimated from the residuals at the prior's mean."""
     fit = cma_search(cost.with_estimated_noise(space.mean), space, config)
     print(f"  CMA-ES: cost {fit.best_cost:.4f} after {len(fit.history.sigma)} generations ({fit.stop})", flush=True)
     return fit
@@ -169,8 +169,8 @@ def find(cost: Cost, space: Space, config: CmaConfig) -> Fit:
 def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estimate:
     """Gauss-Newton from a fitted vector [D], its width calibrated over contiguous blocks of `block` s.
 
-    The noise stated is what `start` leaves unexplained, with its correlation in time.  Raises ValueError
-    where that correlation outlasts a block.
+    The noise and its correlation in time are estimated from the residuals at `start`.  Raises ValueError where the
+    correlation time exceeds a block.
     """
     left = residual(cost, start)
     longest = noise.correlation_time(left).max()
@@ -183,9 +183,9 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
 
 
 def table(result: Estimate) -> list[dict[str, Any]]:
-    """One entry per parameter: value, interval, and what this recording tells about it."""
+    """One entry per parameter: value, interval, and whether this recording identifies it."""
     low, high = result.gaussian.interval(LEVEL)
-    told = identifiability(result.gaussian, np.ones(len(result.space)))
+    verdicts = identifiability(result.gaussian, np.ones(len(result.space)))
     return [
         {
             "name": p.name,
@@ -196,8 +196,8 @@ def table(result: Estimate) -> list[dict[str, Any]]:
             "value": float(result.best[i]),
             "interval": [float(low[i]), float(high[i])],
             "excludes_zero": bool(low[i] > 0 or high[i] < 0),
-            "identifiable": told[i].identifiable,
-            "why": told[i].reason,
+            "identifiable": verdicts[i].identifiable,
+            "why": verdicts[i].reason,
         }
         for i, p in enumerate(result.space.parameters)
     ]
@@ -233,7 +233,7 @@ def draw_fit(
 
 
 def publish(folder: Path, name: str, quick: bool, seed: int, result: Mapping[str, Any], figure: Figure) -> None:
-    """Write folder/name.png and folder/name.json, with its origin; print the JSON as one last line."""
+    """Write folder/name.png and folder/name.json, with the origin of the result; print the JSON as the last line."""
     path = folder / f"{common.stem(name, quick)}.png"
     write_bytes(path, png_bytes(figure))
     print(f"  writes {path} and .json")

@@ -3,9 +3,9 @@
     python experiments/knob_locations.py [--quick] [--out DIR] [--seeds 5] [--trials 100]
 
 The door is demonstrated and fitted with the knob in its first place.  For each of the four places, 5 cm apart along the
-lever, policies are trained on doors drawn from that one Gaussian and tried on the synthetic robot with the knob there.
+lever, policies are trained on doors drawn from that Gaussian and tried on the synthetic robot with the knob there.
 Every policy is one JSON file under DIR/knob_cases and is not trained again; the fit, and the policies of the first
-place, are those of table2.py's setting "paper".  DIR/knob_locations.json sums them up; knob_locations.md is the
+place, are those of table2.py's setting "paper".  DIR/knob_locations.json summarises them; knob_locations.md is the
 table, knob_locations.png and .pdf are histograms of the angles.
 """
 
@@ -48,7 +48,7 @@ class Arguments(Options):
     """Options of the experiment."""
 
     knobs: tuple[int, ...] = (0, 1, 2, 3)
-    """Which places."""
+    """Places of the knob."""
 
 
 def case(knob: int, seed: int, setting: Setting, arguments: Arguments, code: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def case(knob: int, seed: int, setting: Setting, arguments: Arguments, code: Map
 
 
 def planned_case(knob: int, seed: int, arguments: Arguments, code: Mapping[str, Any]) -> Case:
-    """A policy of a place, and what its file must say."""
+    """A policy of a place, and the content that its file must have."""
     folder, budget, setting = arguments.cases("knob"), arguments.budget, setting_of("paper", arguments.robot)
     of = {
         "knob": knob,

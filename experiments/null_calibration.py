@@ -3,10 +3,9 @@
     python experiments/null_calibration.py [--quick] [--counts.hinge 150 ...] [--commit HASH] [--out DIR]
 
 Every case draws a robot with all its nuisances and records it; base fit and screening follow.  Only where the
-screening rejects are the other demonstrations recorded and the search taken to its end.  One small JSON a case
-under OUT/null_cases: the run can be stopped and goes on where it was, or be made in pieces, scene by scene, and the
-same command started twice shares the cases; every summary is of all cases of the commit that are there.  Truths and
-seeds come as in the blind suite.
+screening rejects are the other demonstrations recorded and the search completed.  One JSON file per case is written
+under OUT/null_cases.  A stopped run can be continued, and several processes, or runs for single scenes, can share the
+cases.  Every summary is of all existing cases of the commit.  Truths and seeds are drawn as in the blind suite.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class Arguments:
     counts: Counts = field(default_factory=Counts)
     """Cases of each scene."""
     sum_only: bool = False
-    """Make no case: sum up those that are there."""
+    """Run no case; summarise the existing ones."""
     commit: str = "HEAD"
     """Commit that froze the method: seeds derive from it.  "development" draws cases to tune with."""
     out: Path = ROOT / "runs" / "null_calibration"
@@ -74,7 +73,7 @@ class Arguments:
 
 
 def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
-    """One case; what fails is a result too, and keeps the p-value of a screening that was done."""
+    """One case; a failure is a result too, with the p-value of the screening where that was done."""
     watch = Stopwatch()
     result = {
         "scene": plan.scene,
@@ -91,7 +90,7 @@ def case_of(plan: Plan, commit: str, bench: Bench) -> dict[str, Any]:
 
 
 def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterator[dict[str, Any]]:
-    """Screen one case; search it to the end where the screening rejects.  Each part of the result when it is known."""
+    """Screen one case, and complete its search where the screening rejects; yields each part of the result."""
     scene, where = plan.scene, bench.setting(plan.scene)
     found = watch("record", lambda: recorded(where, plan, {}, seed_of(commit, plan.name)))
     if isinstance(found, str):
@@ -122,8 +121,8 @@ def run_case(plan: Plan, commit: str, bench: Bench, watch: Stopwatch) -> Iterato
 def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
     """False alarms with Wilson's intervals, and the p-values' distribution.
 
-    Shares are of the cases that were screened; those that failed, before or after, are counted beside them.  Whether
-    one that failed after its screening rejected would have ended in an alarm is not known (`rejected_then_failed`).
+    Shares are of the cases that were screened; failed cases are counted separately.  For cases that failed after a
+    rejection (`rejected_then_failed`) it is not known whether they would have ended in an alarm.
     """
     failed, cases = sum("error" in c for c in cases), [c for c in cases if "p" in c]
     if not cases:
@@ -147,7 +146,7 @@ def summarise(cases: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def name_of(scene: str, number: int) -> str:
-    """Of a case: its seed derives from it."""
+    """Name of a case, from which its seed derives."""
     return f"{scene}/null/{number}"
 
 
@@ -157,7 +156,7 @@ def file_of(scene: str, number: int, commit: str) -> str:
 
 
 def cases_of(folder: Path, commit: str) -> dict[str, list[dict[str, Any]]]:
-    """Scene -> its cases that are there; those of other commits, which have other seeds, are left out."""
+    """Scene -> its existing cases of this commit; cases of other commits have other seeds."""
     found = dict[str, list[dict[str, Any]]]()
     for path in sorted(folder.glob("*.json")):
         scene, number, _ = path.stem.split("_")
@@ -166,8 +165,8 @@ def cases_of(folder: Path, commit: str) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def told(case: dict[str, Any]) -> str:
-    """One line."""
+def line_of(case: dict[str, Any]) -> str:
+    """A line about a case."""
     p, error = (f"p = {case['p']:.3f}" if "p" in case else ""), (f"error: {case['error']}" if "error" in case else "")
     return ", ".join(filter(None, (p, error)))
 
@@ -188,7 +187,7 @@ def main() -> None:
                     continue
                 case = case_of(Plan(name_of(scene, number), scene, "none"), commit, bench)
                 write_json(path, case)
-                print(f"{scene} {number}: {told(case)}", flush=True)
+                print(f"{scene} {number}: {line_of(case)}", flush=True)
     found = cases_of(folder, commit)
     if not found:
         raise SystemExit(f"error: {folder} holds no case of commit {commit}")

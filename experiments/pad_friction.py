@@ -1,17 +1,20 @@
-"""Do the policies of Table II need their grip?  Each is tried on the synthetic robot with pads that hold less and less.
+"""Do the policies of Table II need their grip?  Each is tried with pads of less and less friction.
 
     python experiments/pad_friction.py [--quick] [--out DIR] [--setting paper] [--frictions 0.05 0.005]
 
-What opens the door is measured as work, at every step of the simulation: the torque about the hinge of what the pads
-do to the knob, over the hinge's motion until the door is open.  Its four parts add up to all that the contacts do:
-across, of the pads' normal forces at right angles to the knob's axis (they push or turn the knob sideways, on the lever
-by which it stands out from the door); along, of normal forces along that axis (on the knob's round ends); sliding, of
-friction (the pull of a grip); torsional, of friction's couple about the normals (a twist).
+The work that opens the door is measured at every step of the simulation: the torque about the hinge of the forces
+between pads and knob, over the hinge's motion until the door is open.  Its four parts add up to the work of all
+contacts:
 
-Writes DIR/pad_friction_SETTING.json, for every policy that has been made and every kind of pads ("own": the setting's,
-whose trials are Table II's; else by sliding friction): success_rate; grip_time_share, of a trial's time, in which the
-grip is on; largest_angle_deg; and of the first few trials opened, how many opened the door, and for each of these
-grip_way_share, of the door's way to open, that it goes with the grip on, and work_j by part.
+- across: normal forces perpendicular to the knob's axis, which push the knob sideways;
+- along: normal forces along that axis, on the knob's round ends;
+- sliding: friction, the pull of a grip;
+- torsional: the couple of friction about the normals, a twist.
+
+Writes DIR/pad_friction_SETTING.json, for every trained policy and every kind of pads ("own": those of the setting, with
+the trials of Table II; else by sliding friction).  It holds success_rate, largest_angle_deg, and grip_time_share, the
+share of a trial's time with the grip on.  Of the first few trials it holds how many opened the door, and for each of
+these work_j by part and grip_way_share, the share of the door's path with the grip on.
 """
 
 from __future__ import annotations
@@ -63,13 +66,13 @@ class Arguments:
     """Options of the experiment."""
 
     setting: str = "paper"
-    """Of Table II."""
+    """Setting of Table II."""
     frictions: tuple[float, ...] = (0.05, 0.005)
     """Sliding frictions of both pads."""
     trials: int = 20
     """Trials of each policy at each friction."""
     policies: Path = REPORTED
-    """Where table2.py has left its policies; default: the reported ones, of benchmarks/results/archive."""
+    """Folder of the policies of table2.py; default: the reported ones in benchmarks/results/archive."""
     quick: bool = False
     """One policy of each method, one short trial: shows that it runs."""
     out: Path = RESULTS
@@ -77,7 +80,7 @@ class Arguments:
 
 
 def robots(setting: Setting, arguments: Arguments) -> dict[str, PolicyRobot]:
-    """The setting's robot ("own") and the same with pads of each friction; it hears the same noise with all."""
+    """The setting's robot ("own") and the same robot with pads of each friction, all with the same noise."""
     task = Task(**{**setting.task, **({"steps": QUICK_STEPS} if arguments.quick else {})})
     start = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), task).start
     config = TransferConfig(trials=1 if arguments.quick else arguments.trials, seed=setting.robot)
@@ -87,7 +90,7 @@ def robots(setting: Setting, arguments: Arguments) -> dict[str, PolicyRobot]:
 
 
 def hinge_torques(model: mujoco.MjModel, data: mujoco.MjData, knob: int, hinge: int) -> np.ndarray:
-    """[4] N m about the hinge of what the pads do to the knob in MuJoCo's last step, by PARTS."""
+    """Torque about the hinge [4] N m of the pads' contact forces in MuJoCo's last step, by PARTS."""
     found, wrench, stem_axis = np.zeros(4), np.zeros(6), data.geom_xmat[knob].reshape(3, 3)[:, 2]
     for index, contact in enumerate(data.contact):
         if knob not in (contact.geom1, contact.geom2):
@@ -104,8 +107,11 @@ def hinge_torques(model: mujoco.MjModel, data: mujoco.MjData, knob: int, hinge: 
 class Opening:
     """Watches a trial until the door is open, step by step on a copy that takes the same actions.
 
-    opened: whether it is.  way: rad that the door has come from where it was shut, and of these held: with the grip
-    on.  work: [4] J by PARTS.  servo: J that the arm's actuators give meanwhile, summed over the joints.
+    opened: whether the door is open.
+    way: rad that the door has moved since it was shut.
+    held: rad of `way` with the grip on.
+    work: [4] J by PARTS.
+    servo: J of the arm's actuators in this time, summed over the joints.
     """
 
     def __init__(self, robot: PolicyRobot):
@@ -115,7 +121,7 @@ class Opening:
         self.copy: mujoco.MjData | None = None
 
     def __call__(self, data: mujoco.MjData) -> None:
-        """What `watched` calls before each action and at the end."""
+        """Called by `watched` before each action and at the end."""
         if self.copy is None:
             self.copy = copy.copy(data)
         elif not self.opened:
@@ -125,7 +131,7 @@ class Opening:
                 raise RuntimeError(f"the copy has left the trial at {data.time:g} s")
 
     def _step(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """One action; the copy needs no more than the opening's part of the last one."""
+        """Simulate one action; of the last one, only the part until the door is open."""
         task, before, scene = self.robot.task, self.way, self.robot.scene
         for _ in range(round(task.control / self.robot.config.timestep)):
             angle, arm = data.qpos[self.hand.hinge], data.qpos[scene.joint_qpos]
@@ -144,7 +150,7 @@ class Opening:
 
 
 def openings(policy: Policy, robot: PolicyRobot, trials: int) -> dict[str, Any]:
-    """What opens the door in a policy's first trials."""
+    """Work that opens the door in a policy's first trials, by part."""
     each = [Opening(robot) for _ in range(trials)]
     for number, opening in enumerate(each):
         watched(policy, robot, number, opening)
@@ -158,7 +164,7 @@ def openings(policy: Policy, robot: PolicyRobot, trials: int) -> dict[str, Any]:
 
 
 def made(arguments: Arguments) -> list[dict[str, Any]]:
-    """The cases of Table II that are there, method by method.  Ends the program where they are of another robot."""
+    """The existing cases of Table II, method by method.  Ends the program where they are of another robot."""
     folder = arguments.policies / "table2_cases" / arguments.setting
     if arguments.policies == REPORTED and not folder.is_dir():
         archive.unpack("policies", REPORTED)
@@ -192,7 +198,7 @@ def rows(cases: Sequence[dict[str, Any]], arguments: Arguments) -> Iterator[dict
 
 
 def needless(tried: Mapping[str, Any]) -> bool:
-    """Whether a policy that was tried with such pads does without a grip; one whose trials all blew up does not."""
+    """Whether a policy succeeds with such pads without a grip; False where all its trials blew up."""
     return (tried["success_rate"] or 0.0) >= NEEDED
 
 

@@ -2,12 +2,11 @@
 
     python experiments/policy_parity.py [--policies runs/train/policy.npz ...] [--quick] [--out DIR]
 
-Each policy without any noise on doors of its own, drawn from the Gaussian beside it (gaussian.json, without effects:
-what it was trained on, or what lies around the mean that a policy of the method "mean" is trained on): each door once
-in MJX with the training's time step, and once in C at 1 ms with a solver that
-has converged.  Start pose and physics are the same, so what differs is the simulation.  Writes DIR/policy_parity.json
-and .png, with the hashes of policy and distribution; the target is a largest opening angle within 3 degrees on every
-door.
+Each policy is run without noise on doors drawn from the Gaussian beside it (gaussian.json, without effects), on which
+it was trained (a policy of the method "mean": on its mean).  Each door is simulated once in MJX with the training's
+time step and once in C at 1 ms with a converged solver.  Start pose and physics are the same, so that only the
+simulation differs.  The target is a difference of the largest opening angle below 3 degrees on every door.  Writes
+DIR/policy_parity.json and .png, with the hashes of policy and distribution.
 """
 
 from __future__ import annotations
@@ -65,15 +64,15 @@ class Arguments:
     """Options."""
 
     policies: tuple[Path, ...] = (ROOT / "runs" / "train" / "policy.npz",)
-    """As `train` writes them, or an experiment with policies; what each was trained on lies beside it."""
+    """Policies of `train` or of an experiment, each with its distribution beside it."""
     quick: bool = False
-    """A policy that has learned nothing, on two doors: shows that it runs."""
+    """An untrained policy on two doors: shows that it runs."""
     out: Path = RESULTS
     """Folder of the results."""
     doors: int = 50
     """Doors of each policy, one episode each."""
     seed: int = 0
-    """Of the first policy's doors; each further policy's is one more, so that no door is counted twice."""
+    """Seed of the first policy's doors; each further policy has the next seed, so that no door is counted twice."""
 
 
 def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
@@ -87,14 +86,14 @@ def trained(policy: Path, gaussian: Path) -> tuple[Policy, DoorEnv, Gaussian]:
 
 
 def untrained() -> tuple[Policy, DoorEnv, Gaussian]:
-    """The same of a training that is over at once."""
+    """The same for a training without updates."""
     scene = door_scene(timestep=TIMESTEP, limits=True)
     env, gaussian = DoorEnv(scene, Task(steps=QUICK_STEPS, spread=0.0)), prior(door_space(scene))
     return train(env, randomised(scene, gaussian), Options(quick=True).budget.config).policy, env, gaussian
 
 
 def named(path: Path) -> dict[str, str]:
-    """A file by its place in the project (elsewhere its name alone) and its hash."""
+    """Path of a file in the project (elsewhere its name alone) and its hash."""
     own = path.resolve()
     where = own.relative_to(ROOT).as_posix() if own.is_relative_to(ROOT) else own.name
     return {"file": where, "sha256": file_sha256(own)}
@@ -131,7 +130,7 @@ def scatter(angles: Sequence[Mapping[str, np.ndarray]]) -> Figure:
 
 
 def compared(policy: Policy, env: DoorEnv, gaussian: Gaussian, doors: int, seed: int) -> dict[str, Any]:
-    """How far a policy opens each of so many doors in either engine, and how far apart that is."""
+    """Opening angles of a policy on each of some doors in either engine, and their difference."""
     values = gaussian.sample(seed, doors)
     both = {"mjx": in_mjx(policy, env, gaussian, values), "c": in_c(policy, env, gaussian, values)}
     angle = {name: np.rad2deg(trials.angle) for name, trials in both.items()}

@@ -2,9 +2,9 @@
 
     python experiments/population_curve.py [--quick] [--out DIR] [--minutes 2] [--populations 30 512]
 
-The one-spring door, demonstration A, everything Table I lists; every population searches for the same
-wall time, from the same prior, with several seeds.  After the search the mean of each generation is
-judged on repeats that the search did not see.  The compilation is done before the clock starts.
+The one-spring door, demonstration A, with all parameters of Table I.  Every population searches for the same wall time,
+from the same prior, with several seeds.  After the search, the cost of each generation's mean is computed on held-out
+repeats.  Compilation is not included in the time.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def prepare() -> tuple[Cost, Cost]:
 def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) -> dict[str, Any]:
     """One search: seconds at the end of each generation and the held-out cost of its mean, N m.
 
-    A generation of another search goes first, so that nothing is compiled on the clock.
+    A generation of another search runs first, so that compilation is not timed.
     """
     config = CmaConfig(
         population=population, parents=None, generations=100_000, tol_cost=0, tol_sigma=1e-5,
@@ -94,18 +94,18 @@ def curve(cost: Cost, held: Cost, population: int, seconds: float, seed: int) ->
 
 
 def _rows(generations: int, most: int = 64) -> np.ndarray:
-    """Generations at which a curve is judged: all, or about `most` of them."""
+    """Generations whose held-out cost is computed: all, or about `most` of them."""
     return np.unique(np.linspace(0, generations - 1, min(generations, most)).astype(int))
 
 
 def at(run: dict[str, Any], seconds: float) -> float | None:
-    """Held-out cost of the latest judged generation finished by then; None before the first."""
+    """Held-out cost of the latest generation finished by then; None before the first."""
     done = [c for row, c in zip(run["rows"], run["held_out"], strict=True) if run["seconds"][row] <= seconds]
     return done[-1] if done else None
 
 
 def one_device(runs: Sequence[Mapping[str, Any]]) -> str:
-    """The device on which all ran.  Ends the program where they differ: their wall times are of one figure."""
+    """The device on which all ran; ends the program where devices differ, since the figure compares wall times."""
     found = sorted({run["origin"]["device"] for run in runs})
     if len(found) > 1:
         raise SystemExit(f"error: searches of several devices: {'; '.join(found)}: choose another --out")

@@ -1,4 +1,4 @@
-"""What two arm poses tell about one door: the paper's distribution figure (section IV-C), from the suite's cases.
+"""Posteriors of one door from two arm poses: the paper's distribution figure (section IV-C), from the suite's cases.
 
     python experiments/pose_figure.py [--quick] [--out DIR]
 
@@ -18,7 +18,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
-from identify_suite import agreement, both_tell, kept_cases  # noqa: E402
+from identify_suite import agreement, identifiable_in_both, kept_cases  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -49,8 +49,8 @@ class Arguments:
 
 @styled
 def densities(a: dict[str, Any], b: dict[str, Any]) -> Figure:
-    """One panel for each parameter that both poses tell: the two densities and the truth."""
-    names = both_tell(a, b)
+    """One panel for each parameter that is identifiable in both poses: the two densities and the truth."""
+    names = identifiable_in_both(a, b)
     known = {p.name: p for p in door_space(door_scene()).parameters}
     columns = 4
     rows = max(1, -(-len(names) // columns))
@@ -86,7 +86,7 @@ def main() -> None:
     a, b = (case["parameters"] for case in cases)
     name = stem("pose_agreement", arguments.quick)
     save(densities(a, b), arguments.out, name)
-    drawn = {n: {"truth": a[n]["truth"], "A": _drawn(a[n]), "B": _drawn(b[n])} for n in both_tell(a, b)}
+    drawn = {n: {"truth": a[n]["truth"], "A": _drawn(a[n]), "B": _drawn(b[n])} for n in identifiable_in_both(a, b)}
     origins = {pose: case["origin"] for pose, case in zip("AB", cases, strict=True)}
     result = {"parameters": drawn, **agreement(*cases), "origin": origins}
     write_json(arguments.out / f"{name}.json", result, indent=2)

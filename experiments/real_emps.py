@@ -1,10 +1,10 @@
-"""EMPS, a real one-axis benchmark, as a user's own scene: mass and friction against published values.
+"""EMPS, a real one-axis benchmark, in a scene of its own: mass and friction against published values.
 
     python experiments/real_emps.py --data DIR
 
 The scene is `emps.xml`; the log is replayed in inverse mode on the motor side (force = gtau * vir) and
 mass, viscous damping, friction loss and offset are identified from DATA_EMPS by CMA-ES and
-Gauss-Newton, then judged on DATA_EMPS_PULSES, another run with steps in its reference.
+Gauss-Newton.  The test data are DATA_EMPS_PULSES, another run with steps in its reference.
 
 Data: A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS, Workshop on Nonlinear
 System Identification Benchmarks, 2019 (nonlinearbenchmark.org).  DIR holds its two files converted
@@ -16,8 +16,8 @@ measured and simulated force at 8 Hz, as everywhere in this program.  Between 20
 does not matter (mass within 0.1 %); at 8 Hz it would round off the jumps of acceleration and make the
 mass 1 % too large.
 
-Dry friction is loss * sgn(speed) at every sample, as in the published fit.  The program's own law, by which a carriage
-at rest is held by anything up to the loss (docs/method.md), is fitted beside it: `friction_at_rest`.
+Dry friction is loss * sgn(speed) at every sample, as in the published fit.  The program's own law, in which friction at
+rest is any force up to the loss (docs/method.md), is fitted in addition: `friction_at_rest`.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class RealEmps:
     """Identify the EMPS benchmark's carriage from its real log.
 
     data: folder with DATA_EMPS.npz and DATA_EMPS_PULSES.npz.
-    quick: a short search; its numbers are not for keeping.
+    quick: a short search; its numbers are not to be reported.
     out: folder for real_emps.json and real_emps.png.
     seed: of the search.
     """
@@ -118,14 +118,17 @@ def load_emps(folder: Path, name: str) -> Recording:
 
 
 def make_costs(scene: Scene, space: Space, folder: Path, rest: RestConfig = SIGN_LAW) -> tuple[Cost, Cost]:
-    """Costs of the file to fit and of the file to judge by, under a law of friction at rest."""
+    """Costs of the file to fit and of the test file, under a law of friction at rest."""
     recordings = (load_emps(folder, name) for name in (FIT, JUDGE))
     fit, judge = (inverse_cost(scene, space, one, MOTION_CUTOFF, rest=rest) for one in recordings)
     return fit, judge
 
 
 def set_valued(scene: Scene, space: Space, folder: Path, start: np.ndarray, published: Cost) -> dict[str, Any]:
-    """The fit from `start` [D] under the set-valued law, judged by both laws; published: the judge of the other."""
+    """The fit from `start` [D] under the set-valued law, tested under both laws.
+
+    published: cost of the test file under the published law.
+    """
     cost, judge = make_costs(scene, space, folder, RestConfig())
     found = estimate(cost, space, start, BLOCK)
     return {
@@ -157,7 +160,7 @@ def against_published(found: Estimate) -> dict[str, dict[str, Any]]:
 
 
 def trace_figure(cost: Cost, before: np.ndarray, after: np.ndarray) -> Any:
-    """Force of the judged file, measured and simulated, before and after the fit."""
+    """Force of the test file, measured and simulated, before and after the fit."""
     measured = measured_torque(cost)
     lines = {
         "before the fit": (measured - residual(cost, before), style.BEFORE),
@@ -168,7 +171,7 @@ def trace_figure(cost: Cost, before: np.ndarray, after: np.ndarray) -> Any:
 
 
 def main(config: RealEmps) -> None:
-    """Fit one file, judge on the other, write figure and JSON."""
+    """Fit one file, test on the other, write figure and JSON."""
     scene = emps_scene()
     space = emps_space(scene)
     cost, judge = make_costs(scene, space, config.data)

@@ -1,10 +1,10 @@
-"""A leg in the air, positions alone: fitted to one half of a log, judged on the other, through the commands alone.
+"""A leg in the air, by positions alone: fitted to one half of a log, tested on the other, with the program's commands.
 
     python experiments/real_go2.py --data DIR
 
 `identify` fits armature, damping, dry friction and encoder zero of the three joints of a Go2's front left leg, and a
 delay (`go2.json`), to the first six seconds.  `evaluate-fit` replays the whole log open loop; the last six seconds
-judge.  `go2.toml` says which columns of the log are what.
+are the test data.  `go2.toml` is the column map.
 
 Data: iit-DLSLab/sim2real-robot-identification (BSD 3-clause), `datasets/go2/traj_0.pt`, its first 12 s.  DIR holds
 go2_first_12s.npz with time [s], desired_position and position [T, 12] rad.  It is not part of this repository.
@@ -26,17 +26,17 @@ LOG = "go2_first_12s.npz"
 SOURCE = "The log is the first 12 s of traj_0.pt of iit-DLSLab/sim2real-robot-identification, with the trunk in a rig."
 HALF, END = 6.0, 11.995  # s
 WHEN = ("before", "after")
-# Mean absolute position error on a part of the log that is kept back, mrad (hip, thigh, calf): the maker's model, and
+# Mean absolute position error on held-out data, mrad (hip, thigh, calf): the maker's model, and
 # one fitted to torques that were reconstructed from the servo's law.
 OTHERS = {"maker's model": [10.4, 12.2, 14.9], "fitted to reconstructed torque": [8.4, 5.6, 7.2]}
 
 
 @dataclass(frozen=True)
 class RealGo2:
-    """Fit a quadruped's leg to half a log of positions, judge it on the other half.
+    """Fit a quadruped's leg to half a log of positions, test it on the other half.
 
     data: folder with the log.
-    quick: two seconds of each half and a short search; its numbers are not for keeping.
+    quick: two seconds of each half and a short search; its numbers are not to be reported.
     out: folder for real_go2.json, and for the runs below `real_go2_runs`.
     seed: of the search.
     """
@@ -48,7 +48,7 @@ class RealGo2:
 
 
 def in_mrad(errors: list[float]) -> list[float]:
-    """[J] rad as mrad, to the microradian."""
+    """Angles [J] rad in mrad, rounded to the microradian."""
     return [round(1e3 * error, 3) for error in errors]
 
 

@@ -1,22 +1,22 @@
-"""A real Panda: friction of its joints from one measured motion, judged on the part that was not fitted.
+"""A real Panda: friction of its joints from one measured motion, tested on the part that was not fitted.
 
     python experiments/real_panda.py --data DIR            # one to two minutes on two cores
     python experiments/real_panda.py --data DIR --quick    # does it all work?
 
 The measured motion is replayed in inverse mode through the bare arm (link side, gravity in) and viscous
 damping, Coulomb friction and offset of every joint are identified as observation parameters of the
-link-side torque, by CMA-ES and Gauss-Newton, on the first two thirds; the last third judges.  Four
-models are fitted, and all are reported:
+link-side torque, by CMA-ES and Gauss-Newton, on the first two thirds; the last third is the test data.  Four
+models are fitted and reported:
 
 - friction: the three terms and nothing else.
-- inertia:  and a term proportional to acceleration.  In theory a rotor's inertia lies in front of the
-  link-side sensor and this is zero; what comes out says how wrong the link inertias are.
+- inertia:  friction, and a term proportional to acceleration.  In theory it is zero, because the rotor's inertia acts
+  on the motor side of the sensor; its fitted value shows how wrong the link inertias are.
 - links:    friction, with link masses (3 %) and centres of mass (5 mm) as nuisances, marginalised.
-- bodies:   friction, with each link's whole inertia as ten numbers that are a possible body at every value
+- bodies:   friction, with the whole inertia of each link as ten numbers that are physically consistent at every value
   (`model/inertia.py`), marginalised; draws of its Gaussian are checked in compiled models.
 
-`links` leads, as nuisances are on everywhere in this program but in the paper's preset: gravity
-torques of 20 N m that are 2 % off are as large as the friction looked for.
+`links` is the main model, since nuisances are on everywhere in this program except in the paper's preset: an error of
+2 % in gravity torques of 20 N m is as large as the friction to be identified.
 
 Data: C. Gaz, M. Cognetti, A. Oliva, P. Robuffo Giordano, A. De Luca, Dynamic identification of the
 Franka Emika Panda robot with retrieval of feasible parameters using penalty-based optimization,
@@ -27,8 +27,8 @@ reference_values.json with the published friction.  They are not part of this re
 Filter, fixed beforehand: position at 8 Hz (zero-phase Butterworth, order 4) before it is
 differentiated, measured and simulated torque at 8 Hz.  Rows that only repeat the one before are left
 out, the rest is interpolated to a regular 1 kHz.  The measured velocity lags and is not used.
-The commanded motion has a period of 13.3 s, so the last third repeats a motion that the first two
-thirds hold once: it tests noise, drift and fit, not other motions.
+The commanded motion has a period of 13.3 s, so that the last third repeats a fitted motion: it tests noise, drift and
+fit, not other motions.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ DRAWS = 500  # of the Gaussian, whose bodies are checked
 SCALE_STD, COM_STD, COM_LIMIT = 0.03, 0.005, 0.05  # prior of a link's mass (-) and centre of mass (m)
 OTHER_COM_STD = (0.002, 0.010)  # m, to see how much hangs on that prior
 CLOSE = 0.4  # of the published values
-NOT_FRICTION = ("panda_joint2",)  # its residual is gravity and inertia before it is friction
+NOT_FRICTION = ("panda_joint2",)  # its residual is mostly gravity and inertia, not friction
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class RealPanda:
 
     data: folder with panda_exciting_traj1.npz and reference_values.json.
     out: folder for real_panda.json and real_panda.png.
-    quick: the friction model alone and a short search; its numbers are not for keeping.
+    quick: the friction model alone and a short search; its numbers are not to be reported.
     seed: of the search.
     """
 
@@ -135,7 +135,7 @@ def load_panda(folder: Path) -> Recording:
 
 
 def load_published(folder: Path) -> dict[str, list[float]]:
-    """The published viscous, Coulomb and offset terms of this very log: fv_OSI, fc_OSI, fo_OSI, fv_CLS, ..."""
+    """The published viscous, Coulomb and offset terms of this log: fv_OSI, fc_OSI, fo_OSI, fv_CLS, ..."""
     path = Path(folder) / REFERENCE
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}; --data is the folder that holds it. {SOURCE}")
@@ -150,7 +150,7 @@ def load_published(folder: Path) -> dict[str, list[float]]:
 
 
 def inertia_effect(joints: Sequence[str]) -> Effect:
-    """Adds `inertia[joint]` times the joint's acceleration to the torque; an effect of this experiment alone."""
+    """An effect of this experiment: adds `inertia[joint]` times the joint's acceleration to the torque."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         step = (rollout.time[-1] - rollout.time[0]) / (len(rollout.time) - 1)
@@ -186,7 +186,7 @@ def link_bodies(scene: Scene) -> Space:
 
 
 def possible_bodies(scene: Scene, found: Estimate, seed: int) -> dict[str, Any]:
-    """Draws of the Gaussian as models of the C engine: how many have seven bodies that can be."""
+    """Number of draws of the Gaussian whose seven link inertias are valid in compiled models."""
     rows = [scene.id("body", link) for link in LINKS]
     possible = 0
     for values in found.gaussian.sample(seed, DRAWS):
@@ -210,14 +210,14 @@ def model_space(scene: Scene, model: str) -> Space:
 
 
 def cut(recording: Recording) -> tuple[Recording, Recording]:
-    """The part to fit and the part to judge by."""
+    """The part to fit and the test data."""
     first, last = recording.span
     split = first + SHARE * (last - first)
     return recording.window(first, split), recording.window(split, last)
 
 
 def fit_models(scene: Scene, parts: tuple[Recording, Recording], config: RealPanda) -> dict[str, Any]:
-    """For every model its estimate and its residuals [K, J] on both parts, before and after; how the search went."""
+    """For every model: estimate, residuals [K, J] on both parts before and after, history of the search."""
     out: dict[str, Any] = {}
     friction = np.empty(0)
     for model in MODELS[:1] if config.quick else MODELS:
@@ -247,7 +247,7 @@ def fit_models(scene: Scene, parts: tuple[Recording, Recording], config: RealPan
 
 
 def set_valued(scene: Scene, space: Space, parts: tuple[Recording, Recording], start: np.ndarray) -> dict[str, Any]:
-    """The fit from `start` [D] under the program's own law, by which friction at rest is an interval."""
+    """The fit from `start` [D] under the program's own law, in which friction at rest is an interval."""
     inertia = inertia_effect(scene.joints)
     fitted, judge = (inverse_cost(scene, space, part, MOTION_CUTOFF, [inertia], RestConfig()) for part in parts)
     found = estimate(fitted, space, start, BLOCK)
@@ -311,7 +311,7 @@ def summary(parts: dict[str, Any], published: dict[str, list[float]]) -> dict[st
 
 
 def at_rest(held: dict[str, Any], published: dict[str, list[float]]) -> dict[str, Any]:
-    """The fit under the set-valued law as JSON values, and what its law makes of the fit without it."""
+    """The fit under the set-valued law as JSON values, and the residuals of the other fit under that law."""
     found, judge = held["estimate"], held["judge"]
     return {
         "share_at_rest": held["share_at_rest"],
@@ -322,19 +322,20 @@ def at_rest(held: dict[str, Any], published: dict[str, list[float]]) -> dict[str
 
 
 def show(model: str, result: dict[str, Any]) -> None:
-    """A few lines for people."""
+    """Print a few lines about the result."""
     for key in ("held_out_rms_before_Nm", "held_out_rms_after_Nm", "held_out_ratio"):
         print(f"  {key:24s} {'  '.join(f'{v:6.3f}' for v in result[key])}")
     for key in ("value_Nm", "over_OSI", "over_CLS"):
         print(f"  {'Coulomb ' + key:24s} {'  '.join(f'{v:6.3f}' for v in result['coulomb'][key])}")
     silent = [p["name"] for p in result["parameters"] if not p["identifiable"] and not p["nuisance"]]
     print(
-        f"  {model}: {result['joints_halved']} of 7 joints halved; this log tells little of: {', '.join(silent) or '-'}"
+        f"  {model}: {result['joints_halved']} of 7 joints halved; not identifiable from this log: "
+        f"{', '.join(silent) or '-'}"
     )
 
 
 def residual_figure(time: np.ndarray, models: dict[str, dict[str, Any]], leading: str) -> Any:
-    """Held-out torque that the rigid body leaves unexplained, and what each model makes of it."""
+    """Held-out torque that rigid bodies do not explain, and its prediction by each model."""
     measured = models[leading]["before"]["held_out"]
     plain = models["friction"]
     lines = {"friction": (measured - plain["after"]["held_out"], style.BEFORE)}
@@ -345,7 +346,7 @@ def residual_figure(time: np.ndarray, models: dict[str, dict[str, Any]], leading
 
 
 def main(config: RealPanda) -> None:
-    """Fit the first two thirds, judge on the last, write figure and JSON."""
+    """Fit the first two thirds, test on the last, write figure and JSON."""
     published = load_published(config.data)
     recording = load_panda(config.data)
     scene = panda_arm_scene()

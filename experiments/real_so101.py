@@ -1,16 +1,16 @@
-"""The SO-101 arm, positions alone: fitted to two of its motions, judged on four others, through the commands alone.
+"""The SO-101 arm, by positions alone: fitted to two motions, tested on four others, with the program's commands.
 
     python experiments/real_so101.py --data DIR [--gap]
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
 friction of each of the first five joints, one armature that they share, and a delay), with the library's limit of the
 acceleration of each servo's own goal: an STS3215 draws ramps between its goals, and LeRobot sets their steepest, 254
-times 100 counts/s^2 or 39 rad/s^2.  `so101.toml` says which columns
-of a log are what.  `evaluate-fit` replays the other motions open loop, over their whole length.
+times 100 counts/s^2 or 39 rad/s^2.  `so101.toml` is the column map.  `evaluate-fit` replays the other motions open
+loop, over their whole length.
 
 Data: isaac-sim2real/sage (Apache 2.0), `output/real/so101/custom`.  DIR holds a folder for each motion, with
 control.csv.gz and state_motor.csv.gz, and the arm without meshes, so101_air.xml.  They are not part of this repository.
-MuJoCo's default friction creeps where the arm stands still; a fit holds it (`--joint-friction`).
+MuJoCo's default friction creeps where the arm stands still; the fit uses hard friction (`--joint-friction`).
 
 With --gap: what does a model of 24 parameters and a delay (gain, armature, damping and friction of each of the six
 joints) with MuJoCo's default friction lack?  `identify` fits it to the four motions and `gap` searches them from there;
@@ -59,12 +59,13 @@ DELAY = {"sensor": "time_offset", "std": 0.005, "high": 0.05}
 
 @dataclass(frozen=True)
 class RealSo101:
-    """Fit the SO-101 arm to positions of two motions, judge it on four others.
+    """Fit the SO-101 arm to positions of two motions, test it on four others.
 
     data: folder with the motions.
     gap: search what 24 parameters with MuJoCo's default friction lack, in place of the fit; half an hour or more.
     budget: minutes after which that search tries no further candidate; 0: none.
-    quick: the first seconds of a motion to fit and one to judge, and a short search; its numbers are not for keeping.
+    quick: the first seconds of a motion to fit and of a test motion, and a short search; its numbers are not to be
+        reported.
     seconds: of each motion, from its start.
     out: folder for real_so101.json, and for the runs below `real_so101_runs`.
     seed: of the search.
@@ -122,7 +123,7 @@ def _mrad(errors: Any) -> float:
 
 
 def searched(config: RealSo101) -> dict[str, Any]:
-    """What `gap` says of the four motions, and the errors of all six, of the first five joints."""
+    """Result of `gap` on the four motions, and the errors of all six motions, of the first five joints."""
     seconds = 15.0 if config.quick else config.seconds
     of = {motion: so101_log(config.data, motion, seconds) for motion in (*JUDGES, *FIT)}
     runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
@@ -136,7 +137,7 @@ def searched(config: RealSo101) -> dict[str, Any]:
     fitted(scene_of(config.data), parameters, fit, judges, runs / "identify_24", [*own, *few])
     command(
         ["gap", "--scene", scene_of(config.data), "--parameters", parameters, *own, *options,
-         "--fit", runs / "identify_24", "--recording", *fit, "--judge-on", *judges, "--out", runs / "gap"]
+         "--fit", runs / "identify_24", "--recording", *fit, "--test-recording", *judges, "--out", runs / "gap"]
     )  # fmt: skip
     found = json.loads((runs / "gap" / GAP).read_text())
     mae = {
@@ -168,7 +169,7 @@ def searched(config: RealSo101) -> dict[str, Any]:
 
 
 def main(config: RealSo101) -> None:
-    """One fit and four judges, or one search; one line of JSON."""
+    """One fit tested on four motions, or one search; prints one line of JSON."""
     name = "real_so101_quick" if config.quick else "real_so101"
     path = config.out / f"{name}.json"
     known = json.loads(path.read_text()) if path.is_file() else {}

@@ -1,4 +1,4 @@
-"""A real servo, positions alone: fitted at two firmware gains, judged on the third, through the commands alone.
+"""A real servo, by positions alone: fitted at two firmware gains, tested on the third, with the program's commands.
 
     python experiments/real_xl330.py --data DIR
 
@@ -26,15 +26,18 @@ from xl330_logs import GAINS, MOTIONS, SOURCE, log_name, xl330_log
 from benchmarks import common
 
 EFFECTS = ("gear_friction",)
-PUBLISHED = {"M1": 0.064, "M6": 0.0455}  # rad, mean of the twelve logs, fitted by their authors to all, re-simulated
+PUBLISHED = {
+    "M1": 0.064,
+    "M6": 0.0455,
+}  # rad, mean over the twelve logs of the authors' fit to all of them, simulated again here
 
 
 @dataclass(frozen=True)
 class RealXl330:
-    """Fit a real servo at two gains, judge it on the third.
+    """Fit a real servo at two gains, test it on the third.
 
     data: folder with the logs.
-    quick: one fold, two motions and a short search; its numbers are not for keeping.
+    quick: one fold, two motions and a short search; its numbers are not to be reported.
     out: folder for real_xl330.json, and for the runs below `real_xl330_runs`.
     seed: of the searches.
     """
@@ -46,7 +49,7 @@ class RealXl330:
 
 
 def fold(config: RealXl330, paths: dict[str, Path], judge: int, motions: tuple[str, ...]) -> dict[str, Any]:
-    """One fold: the fit at the other gains, and the errors of every log of the gain that judges."""
+    """One fold: the fit at the other gains, and the errors of every log of the test gain."""
     runs = config.out / ("real_xl330_quick_runs" if config.quick else "real_xl330_runs") / f"kp{judge}"
     fit_on = [paths[log_name(m, gain)] for gain in GAINS if gain != judge for m in motions]
     judge_on = [paths[log_name(m, judge)] for m in motions]

@@ -3,10 +3,10 @@
     python experiments/search_figure.py [--quick] [--out DIR]
 
 Table I's distribution, 30 samples, the five best, linear coordinates, 100 generations on demonstration A of the door
-without a spring; the program's `identify --preset paper`, which goes on where it was stopped (where it differs from
-the paper: docs/paper.md).  Writes
-search_torques, search_parameters and search_cost (.png and .pdf) and search_figure.json into DIR, the run into
-DIR/search_run.  The lines of the truth are the paper's fitted means; search_figure.json holds its deviations beside.
+without a spring.  It is the program's `identify --preset paper`, which continues a stopped run (docs/paper.md lists
+differences from the paper).  Writes search_torques, search_parameters and search_cost (.png and .pdf) and
+search_figure.json into DIR, the run into DIR/search_run.  The lines of the truth are the paper's fitted means;
+search_figure.json also holds its deviations.
 A fit of a minute or more on two cores (6.4 minutes at f42592d). Without --out it replaces the committed figures.
 """
 
@@ -60,11 +60,11 @@ def figures(found: Run) -> dict[str, Any]:
 
 
 def made_by(found: Run) -> dict[str, Any]:
-    """Where the run comes from, in the words of `origin`: one that is drawn again stays of the code that made it."""
-    told = found.config
-    versions = {name: version for name, version in told.versions.items() if name != "git"}
-    of = {"commit": told.versions.get("git"), "versions": versions, "device": told.device, "seed": told.seed}
-    return {**of, "date": told.started}
+    """Origin of the run, as `origin` states it; a figure that is drawn again keeps the origin of its run."""
+    config = found.config
+    versions = {name: version for name, version in config.versions.items() if name != "git"}
+    of = {"commit": config.versions.get("git"), "versions": versions, "device": config.device, "seed": config.seed}
+    return {**of, "date": config.started}
 
 
 def main() -> None:

@@ -4,9 +4,9 @@
 
 Reads the cases door_0, door_1 and door_2 of `identify_suite.py` in DIR/identify_cases (that script makes them);
 writes DIR/table1.md and DIR/table1.json.  The paper's fitted means are the hidden truth of the synthetic robot (its
-recordings are not public), all but the joints' damping, which here is the servo's (docs/paper.md).  So the
-program's best fit is to be near the paper's mean; widths are each one's own: the paper's deviation, and here the ends
-of the 90 % interval, which of a value that is fitted in its logarithm do not lie alike on both sides.
+recordings are not public), except the joints' damping, which here is the servo's (docs/paper.md).  The program's best
+fit should therefore be near the paper's mean.  Widths cannot be compared directly: the paper gives a deviation, this
+program the ends of the 90 % interval, which is asymmetric for a value that is fitted in its logarithm.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class Arguments:
     out: Path = ROOT / "benchmarks" / "results"
     """Folder with identify_cases."""
     quick: bool = False
-    """Read the cases of a quick suite, which has the door with one spring alone."""
+    """Read the cases of a quick suite, which has only the door with one spring."""
 
 
 def table(cases: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     """Parameter -> the paper's (mean, deviation) and, by door, truth, best fit, 90 % interval, whether that holds the
-    truth and whether the motion tells the parameter.
+    truth, and whether the parameter is identifiable.
 
     cases: by number of springs, "parameters" of the suite's cases.
     """
@@ -98,8 +98,8 @@ def as_markdown(rows: Mapping[str, Any], units: Mapping[str, str], commits: Sequ
     springs = {"0": "no spring", "1": "one spring", "2": "two springs"}
     columns = ("{}, paper", "truth here", "best here (90 %)")
     head = ["", "initial, paper", *(column.format(springs[d]) for d in doors for column in columns)]
-    told = ", ".join(f"`{commit[:7]}`" for commit in commits)
-    lines = [CAPTION.format(commits=told)]
+    listed = ", ".join(f"`{commit[:7]}`" for commit in commits)
+    lines = [CAPTION.format(commits=listed)]
     lines += ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, row in rows.items():
         unit = "" if units[name] == "-" else f" [{units[name]}]"
@@ -136,9 +136,10 @@ def main() -> None:
     origins = {str(k): case["origin"] for k, case in cases.items()}
     write_text(arguments.out / f"{name}.md", as_markdown(rows, units_of(), commits(found)))
     write_json(arguments.out / f"{name}.json", {"parameters": rows, "origin": origins}, indent=2)
-    told = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
-    inside = sum(bool(d["inside"]) for d in told)
-    print(json.dumps({"identifiable": len(told), "inside_90": inside, "table": str(arguments.out / f"{name}.md")}))
+    identifiable = [d for r in rows.values() for d in r["doors"].values() if d["identifiable"]]
+    inside = sum(bool(d["inside"]) for d in identifiable)
+    table_file = str(arguments.out / f"{name}.md")
+    print(json.dumps({"identifiable": len(identifiable), "inside_90": inside, "table": table_file}))
 
 
 if __name__ == "__main__":

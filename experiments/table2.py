@@ -1,16 +1,15 @@
-"""Table II of the paper: three ways to choose the doors that a policy is trained on, judged on a robot it never saw.
+"""Table II of the paper: three ways to choose the doors that a policy is trained on, tested on the synthetic robot.
 
     python experiments/table2.py [--quick] [--out DIR] [--settings paper] [--seeds 5] [--trials 100]
 
-For each setting: the synthetic robot is recorded and fitted once; then policies are trained on draws of the prior, on
-the fitted mean alone and on draws of the fitted Gaussian, alike in everything else, and tried in simulation and on the
-synthetic robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again (nor is one that another
-experiment has trained, DIR/trained_cases): the experiment can be stopped and goes on where it was, and the same
-command started twice shares the work.  DIR/table2.json sums up all that are there, with intervals by bootstrap over
-policies; table2.md is laid out as in the paper, table2.png and table2.pdf are its histogram.  Where
-hidden_effect_policy.json lies beside them, it is the table's last part.  Pilots take another robot and other seeds
-(--robot 100 --first 100).
-docs/history/policy-experiments.md says what was fixed before the runs.
+For each setting, the synthetic robot is recorded and fitted once.  Policies are then trained on draws of the prior, on
+the fitted mean and on draws of the fitted Gaussian, with all else equal, and tried in simulation and on the synthetic
+robot.  Every policy is one JSON file under DIR/table2_cases and is not trained again, nor is one that another
+experiment has trained (DIR/trained_cases).  A stopped experiment can be continued, and several processes can share the
+work.  DIR/table2.json summarises all existing policies, with intervals by bootstrap over policies.  table2.md is laid
+out as in the paper; table2.png and table2.pdf are its histogram.  Where hidden_effect_policy.json exists in DIR, it is
+the last part of the table.  Pilots use another robot and other seeds (--robot 100 --first 100).
+docs/history/policy-experiments.md lists what was fixed before the runs.
 """
 
 from __future__ import annotations
@@ -55,13 +54,13 @@ class Arguments(Options):
     """Options of the experiment."""
 
     settings: tuple[str, ...] = tuple(SETTINGS)
-    """Which doors."""
+    """Settings of Table II."""
     methods: tuple[Method, ...] = METHODS
-    """Which methods."""
+    """Methods to train."""
 
 
 def case(method: Method, seed: int, setting: Setting, arguments: Options, code: Mapping[str, Any]) -> dict[str, Any]:
-    """One policy of one method: what it is trained on is the one thing in which methods differ."""
+    """One policy of one method; methods differ only in the doors of the training."""
     budget = arguments.budget
     env = DoorEnv(door_scene(timestep=TIMESTEP, limits=True), budget.task(Task(**setting.task)))
     space = door_space(env.scene) + door_nuisances(env.scene)  # those of the fit
@@ -70,7 +69,7 @@ def case(method: Method, seed: int, setting: Setting, arguments: Options, code: 
 
 
 def planned_case(method: Method, seed: int, name: str, arguments: Arguments, code: Mapping[str, Any]) -> Case:
-    """A policy of a method in a setting, and what its file must say."""
+    """A policy of a method in a setting, and the content that its file must have."""
     setting, folder, budget = setting_of(name, arguments.robot), arguments.cases("table2") / name, arguments.budget
     task = asdict(budget.task(Task(**setting.task)))
     of = {"setting": asdict(setting), "task": task, "method": method, "seed": seed, "budget": budget.to_json()}

@@ -1,4 +1,4 @@
-"""A verdict's names and validation tests as plain data, as the experiments keep them."""
+"""Names and validation tests of a verdict as plain data, for the experiments' result files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from droid_jax.storage import finite
 
 
 def answer_json(verdict: Verdict) -> dict[str, Any]:
-    """What is named, in words: "latch at door_hinge", and the alternatives of each."""
+    """The named effects as text, "latch at door_hinge", and the alternatives of each."""
     return {
         "verdict": verdict.conclusion.value,
         "effects": list(map(str, verdict.effects)),
@@ -20,7 +20,7 @@ def answer_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def validation_json(trial: ValidationTest) -> dict[str, Any]:
-    """Name, figures and what spoke against it; discrepancy_validation is None where the model blew up there."""
+    """Name, numbers and reasons of rejection; discrepancy_validation is None where the model blew up there."""
     return {
         "name": names_of(trial.keys),
         "passed": trial.passed,

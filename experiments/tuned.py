@@ -1,9 +1,9 @@
-"""Importing this prepares jax for many replays; it must come before what starts jax (mjx, evosax)."""
+"""Importing this module prepares jax for many replays; import it before modules that start jax (mjx, evosax)."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the checkout of the script, whatever is installed
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # use the checkout of the script, not an installed package
 
 from droid_jax import runtime
 

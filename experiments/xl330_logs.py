@@ -1,4 +1,4 @@
-"""Logs of a Dynamixel XL330 with a pendulum as recordings: positions and commands, the gain of each stated.
+"""Logs of a Dynamixel XL330 with a pendulum as recordings of positions and commands, with the gain of each.
 
 The logs are Rhoban/bam's (Apache 2.0), `MOTION_kpGAIN.npz`.  They are not part of this repository.
 """
@@ -23,11 +23,11 @@ GAINS = (200, 400, 800)
 STIFFNESS = 0.874 / 400
 RATE = 200.0  # Hz, about the host's 5.4 ms
 SECONDS = 5.95  # of a log, all alike: recordings of one length share a compiled replay
-DRIVEN = 1.95  # s of `lift_and_drop`, whose motor is switched off after 2 s: it is judged up to there
+DRIVEN = 1.95  # s of `lift_and_drop`, whose motor is switched off after 2 s: only this part is used
 
 
 def log_name(motion: str, gain: int) -> str:
-    """Of a recording and of its file."""
+    """Name of a recording and of its file."""
     return f"{motion}_kp{gain}"
 
 

@@ -1,4 +1,4 @@
-"""What all tests share: two virtual CPU devices, a cache of compiled programs, OpenGL, real data."""
+"""Fixtures of all tests: two virtual CPU devices, a cache of compiled programs, OpenGL, real data."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ with mujoco.Renderer(model, 32, 32) as renderer:
 
 
 def _draws(backend: str) -> bool:
-    """Whether MuJoCo can draw with this OpenGL backend, tried in a process of its own."""
+    """Whether MuJoCo can draw with this OpenGL backend, tried in a separate process."""
     environment = {**os.environ, "MUJOCO_GL": backend}
     try:
         run = subprocess.run([sys.executable, "-c", _DRAW], env=environment, capture_output=True, timeout=60)
@@ -76,7 +76,7 @@ def archived(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 @pytest.fixture
 def tuned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For commands that are called in this process, where jax runs already and could not be tuned any more."""
+    """Replaces `tune` for commands called in this process, where jax runs already and cannot be tuned."""
     monkeypatch.setattr(runtime, "tune", lambda *a, **k: None)
 
 
@@ -112,7 +112,7 @@ def _line(width: float) -> Figure:
 
 @pytest.fixture(scope="module")
 def one_line() -> Iterator[None]:
-    """Figures are made; saved and put into the page is one line in their place."""
+    """Figures are made, but one line in their place is saved and put into the page."""
     drawing = style.drawing
 
     def line_drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> style.Drawing:

@@ -1,4 +1,4 @@
-"""A pendulum on a position servo, simulated in plain C with fine steps, for tests of what positions alone tell."""
+"""A pendulum on a position servo, simulated in plain C with fine steps, for tests of fits to positions alone."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def write_pendulum(folder: Path) -> tuple[str, ...]:
 
 
 def ramped(goal: np.ndarray, steepest: float, step: float = 1e-4) -> np.ndarray:
-    """[T] a place that follows a goal [T] from rest, accelerates by at most so much and brakes in time."""
+    """Positions [T] that follow a goal [T] from rest with bounded acceleration and without overshoot."""
     place, speed, out = goal[0], 0.0, []
     for aim in goal:
         way = aim - place
@@ -67,7 +67,7 @@ def swung(
     command: np.ndarray | None = None,
     steepest: float = np.inf,
 ) -> Recording:
-    """What the true pendulum does at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz].
+    """Recording of the true pendulum at a servo gain kp [N m/rad] that follows a sine of a frequency [Hz].
 
     command: [T] at RATE, in place of the sine.  steepest: rad/s^2, by which the servo's own goal accelerates at most.
     """

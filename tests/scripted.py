@@ -1,4 +1,4 @@
-"""An opening by the book, for tests: commands to the knob, grip and pull, and a policy that plays them."""
+"""A scripted opening for tests: commands to the knob, grip and pull, and a policy that plays them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REACH, GRIP = 0.8, 0.4  # s
 
 
 def opening(scene: Scene, task: Task, seconds: float, angle: float, hold: float = 0.0) -> np.ndarray:
-    """[K, 9] commands, the servo's lag made up for."""
+    """Commands [K, 9] that compensate the lag of the servo."""
     reach, grip, pull, rest = (round(s / task.control) for s in (REACH, GRIP, seconds, hold))
     angles = np.concatenate([np.zeros(reach + grip), np.linspace(0.0, angle, pull), np.full(rest, angle)])
     standoffs = np.concatenate([np.linspace(task.standoff, 0.0, reach), np.zeros(grip + pull + rest)])

@@ -81,7 +81,7 @@ def demonstration(name: str) -> Recording:
 
 @functools.cache
 def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
-    """What the synthetic robot measures."""
+    """A recording of the synthetic robot."""
     scene, space = small_scene()
     seed = 1 + ("train", "validation", "test").index(name)
     config = SyntheticRobotConfig(repeats=repeats, timestep=0.00025)
@@ -90,7 +90,7 @@ def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: floa
 
 
 def quiet(stage: str, value: object) -> None:
-    """Progress that nobody sees."""
+    """A progress function that does nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def small() -> Small:
 
 
 def problem_of(found: Small, deadline: float | None = None, progress: Progress = quiet) -> Problem:
-    """What every step of the search is given."""
+    """The problem that every step of the search receives."""
     before = found.case.validation.discrepancy_at(found.base.values)
     asked = directions_of(candidates(found.case.effects))
     return Problem(found.case, found.base, before, FLOOR, asked, deadline, progress)
@@ -129,7 +129,7 @@ def problem_of(found: Small, deadline: float | None = None, progress: Progress =
 def largest_t(scores: np.ndarray) -> tuple[np.ndarray, float]:
     """[K] t of each of K directions with scores [K, N], and the p-value of the largest |t| among them.
 
-    As the textbook has it: the search's own tests are put beside it.
+    Computed by the textbook formula, to be compared with the tests of the search.
     """
     t = t_values(scores, sign_flips(scores.shape[1]))
     largest = np.max(np.abs(t), axis=1)

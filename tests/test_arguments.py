@@ -1,4 +1,4 @@
-"""Arguments are checked as files are: one sentence that names the argument, its place and what it was."""
+"""Arguments are checked like files: one sentence names the argument, its place and its value."""
 
 from __future__ import annotations
 

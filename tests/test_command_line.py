@@ -1,4 +1,4 @@
-"""The command line on bad input: one sentence, exit code 2, and what was there before is there after."""
+"""The command line on bad input: one sentence, exit code 2, and existing files stay unchanged."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+import tyro
 from small_log import elbow_log, write_elbow
 
 from droid_jax import run
@@ -78,7 +79,7 @@ def parameters(tmp_path: Path, *entries: object) -> Path:
 @pytest.mark.parametrize("arguments", [["--recording"], ["--recording", ""], ["--recording", "--preset", "quick"]])
 @pytest.mark.parametrize("command", ["all", "identify", "gap"])
 def test_recordings_that_an_empty_variable_named(refused, command: str, arguments: list[str]):
-    """Left away, a synthetic robot would record, and its results pass for one's own."""
+    """Without the option a synthetic robot would be recorded, and its results mistaken for those of the real one."""
     assert "--recording names no file" in refused(command, *arguments)
 
 
@@ -123,7 +124,7 @@ def test_a_recording_with_nan(refused, run_folder: Path, tmp_path: Path):
 @pytest.mark.parametrize("name", ["fit.bag", "fit/repeat_00.mcap", "fit/metadata.yaml", "fit/repeat_00/metadata.yaml"])
 @pytest.mark.parametrize("command", ["identify", "gap"])
 def test_bags_are_sent_through_convert(refused, tmp_path: Path, name: str, command: str):
-    """They do not say what their efforts are, and these commands have no option for it."""
+    """Bags do not state what their efforts are, and these commands have no option for it."""
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text("")
     said = refused(command, "--recording", tmp_path / name.split("/")[0], "--out", tmp_path / "run")
@@ -143,7 +144,7 @@ def test_a_gpu_that_is_not_there_is_said_once(
 
 
 def test_two_recordings_of_one_name(refused, tmp_path: Path):
-    """Said before the folder is begun."""
+    """Refused before anything is written to the folder."""
     first, second = tmp_path / "first.npz", tmp_path / "second.npz"
     for path in (first, second):
         save_recording(load_recording(small_recording(tmp_path), name="repeat_00"), path)
@@ -159,7 +160,7 @@ def test_a_cutoff_that_filters_nothing(refused, tmp_path: Path, command: str):
 
 
 def stopped_in_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever is given to `identify` is found good, and its search ends at once in an error."""
+    """Input of `identify` is accepted, and the search ends at once with an error."""
 
     def stopped(*_, **__) -> None:
         raise ValueError("stopped")
@@ -170,7 +171,7 @@ def stopped_in_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_same_files_in_another_place_are_the_same_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What they say counts: an absolute path instead of a relative one, or a folder of another name."""
+    """Only content counts: paths may be absolute or relative, and folders may have other names."""
 
     stopped_in_the_search(monkeypatch)
     monkeypatch.chdir(tmp_path)
@@ -200,7 +201,7 @@ def test_input_that_cannot_be_read_leaves_no_folder(refused, tmp_path: Path, com
 
 
 def test_an_edited_nuisance_makes_another_run(refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The setup knows the whole parameter file, not only what is of interest in it."""
+    """The setup holds the whole parameter file, not only the parameters of interest."""
 
     stopped_in_the_search(monkeypatch)
 
@@ -287,7 +288,7 @@ def test_starting_over_with_bad_input_keeps_the_old_run(refused, run_folder: Pat
 
 @pytest.mark.parametrize("command", ["identify", "gap"])
 def test_a_recording_that_the_scene_does_not_know_leaves_the_folder_as_it_was(refused, run_folder: Path, command: str):
-    """Of an earlier run with --again, and of none: the same command with a better log finds nothing in its way."""
+    """With files of an earlier run (--again) or without: the same command with a better log can run."""
     recording = elbow_log(0.0, 36.0)
     channels = {name: replace(c, columns=("elbwo",)) for name, c in recording.channels.items()}
     save_recording(replace(recording, channels=channels), run_folder.parent / "log.npz")
@@ -412,7 +413,7 @@ def test_the_same_name_twice(refused, tmp_path: Path):
 )
 def test_an_option_of_a_scene_without_a_scene(refused, tmp_path: Path, command: str, option: tuple[str, str]):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
-    assert f"{option[0]} is for a scene of your own: give --scene too" in said
+    assert f"{option[0]} is for your own scene: give --scene too" in said
     assert not (tmp_path / "run").exists()
 
 
@@ -431,12 +432,19 @@ def test_an_option_of_the_synthetic_robot_beside_recordings(
     refused, tmp_path: Path, command: str, option: tuple[str, str]
 ):
     said = refused(command, *option, "--recording", "log.npz", "--out", tmp_path / "run")
-    assert f"{option[0]} is for the synthetic robot, and --recording says that there is none" in said
+    assert f"{option[0]} is for the synthetic robot, which is not recorded with --recording" in said
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("command", [Identify, GapCommand])
+@pytest.mark.parametrize("option", ["--test-recording", "--judge-on"])
+def test_test_recordings_keep_their_earlier_option(command: type, option: str):
+    parsed = tyro.cli(command, args=["--recording", "a.npz", option, "b.npz", "c.npz"])
+    assert parsed.judge_on == (Path("b.npz"), Path("c.npz"))
+
+
 def test_options_of_the_synthetic_robot_are_filled_in_where_it_records():
-    """A page lists what was asked for: of a robot's own recordings it would say a number of springs that is none's."""
+    """The page lists options: with recordings of a real robot it must not state a number of springs."""
     assert with_robot_options(Identify()) == Identify(springs=1, demonstrations=("A", "C"))
     assert with_robot_options(Identify(springs=2)).springs == 2
     own = Identify(recording=(Path("log.npz"),))
@@ -458,13 +466,13 @@ def test_scalars_that_nothing_can_write_are_said_at_once(refused, tmp_path: Path
     [(["--population", "1"], "population"), (["--generations", "0"], "generations"), (["--restarts", "0"], "restarts")],
 )
 def test_a_search_that_cannot_be(refused, tmp_path: Path, options: list[str], expected: str):
-    """Said before anything long begins."""
+    """Refused before anything long begins."""
     said = refused("identify", *options, "--recording", small_recording(tmp_path), "--out", tmp_path / "run")
     assert f"{expected} must be at least" in said
 
 
 def small_recording(tmp_path: Path) -> Path:
-    """A valid recording, of too little to fit anything."""
+    """A valid recording, too short to fit anything."""
     time = np.arange(10) * 0.01
     head = {
         "torque": {"side": "motor", "gravity": False},
@@ -483,7 +491,7 @@ def test_a_demonstration_that_does_not_exist(refused, tmp_path: Path):
 
 
 def test_what_record_wrote_says_which_robot_it_was(tmp_path: Path):
-    """A fit of it knows its truth, and a policy is tried on this robot and no other."""
+    """A fit of it knows the true values, and a policy is tried on this robot only."""
     recording = replace(load_recording(demonstration_path("A")), meta={"springs": "2", "robot": "7"})
     save_recording(recording, tmp_path / "c.npz")
     assert known_robot([tmp_path / "c.npz"]) == {"springs": 2, "seed": 7, "hide": []}
@@ -523,7 +531,7 @@ COMMANDS = (
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_is_quick(command: str):
-    """It loads nothing that takes time, and names what it is about."""
+    """It imports nothing that takes time, and names its subject."""
     arguments = [*command.split(), "--help"]
     code = (
         "import sys\nfrom droid_jax.run import main\n"
@@ -661,7 +669,7 @@ def test_what_an_interrupted_command_promises(
 
 
 def test_nothing_about_warp_is_printed(tmp_path: Path):
-    """In a process of its own: mujoco.mjx says it when it is first imported."""
+    """In a separate process, because mujoco.mjx prints it when it is first imported."""
     command = [
         sys.executable,
         "-m",
@@ -692,7 +700,7 @@ def test_a_negative_seed_is_refused(refused, command: list[str]):
 
 @pytest.mark.parametrize(("before", "kept"), [("gap", ()), ("identify", ("gap.json", "gaussian.json"))])
 def test_starting_over_forgets_another_commands_results(tmp_path: Path, before: str, kept: tuple[str, ...]):
-    """Of the same command its own are forgotten alone, in a folder of several; what judged the fit goes with it."""
+    """Only results of the same command are removed from a shared folder, with the test results of the fit."""
     for name in ("gap.json", "gaussian.json", "gaussian_full.json", "config.json", "evaluation.json", "notes.txt"):
         (tmp_path / name).write_text("{}")
     # identify's own names no command

@@ -1,4 +1,4 @@
-"""The program as a shell sees it, in processes of its own: streams, signals, exit codes."""
+"""The program as a shell command, in separate processes: streams, signals, exit codes."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_an_error_with_a_closed_output(tmp_path: Path):
 
 @pytest.mark.parametrize("arguments", ["--version", "--help", f"convert {LOG} --out log.npz"])
 def test_a_pipe_that_nobody_reads(tmp_path: Path, arguments: str):
-    """All is done where only the last words are not heard."""
+    """The run is done although the reader of its last line is gone."""
     done = shell(f"set -o pipefail; droid-jax {arguments} | true", cwd=tmp_path)
     assert done.stderr == "" and done.returncode in (0, 141)
 
 
 def test_a_run_that_nobody_listens_to_any_more_is_stopped(monkeypatch, capfd, tmp_path: Path):
-    """At the next thing it says, as a shell expects of it."""
+    """At its next output, as a shell expects."""
     script = (
         "import sys\nfrom droid_jax import run, console\nfrom droid_jax.commands import identify\n"
         "def talk(command):\n    for _ in range(100000):\n        print('cost', flush=True)\n    raise ValueError\n"
@@ -66,7 +66,7 @@ def test_a_run_that_nobody_listens_to_any_more_is_stopped(monkeypatch, capfd, tm
     (tmp_path / "talk.py").write_text(script)
     done = shell(f"set -o pipefail; {sys.executable} talk.py | head -n 1", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (141, "cost\n")
-    assert done.stderr == "stopped: nobody reads the output any more; the same command goes on from here\n"
+    assert done.stderr == "stopped: the output is no longer read; the same command goes on from here\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
@@ -80,7 +80,7 @@ def test_an_output_on_a_full_disk():
 
 
 def test_a_disk_that_is_full(tmp_path: Path):
-    """Files may not be larger than 4 kB: what was there is left, whole, and nothing else."""
+    """Files may not exceed 4 kB: existing files stay complete, and no others are left."""
 
     (tmp_path / "log.npz").write_bytes(Path(LOG).read_bytes())
     done = shell(f"trap '' XFSZ; ulimit -f 4; droid-jax convert {LOG} --out log.npz", cwd=tmp_path)
@@ -170,7 +170,7 @@ def test_a_signal_that_was_ignored_from_outside_stays_so(tmp_path: Path):
 
 
 def test_code_that_holds_a_signal_back_does_not_keep_the_program_alive(tmp_path: Path):
-    """A compiler of minutes; and what was to be tidied up is."""
+    """Like a compiler that runs for minutes; the program still tidies up."""
     script = (
         "import sys, ctypes, pathlib\nfrom droid_jax import run, console\nfrom droid_jax.commands import identify\n"
         "def hold(command):\n"

@@ -115,7 +115,7 @@ def test_a_number_that_is_none_is_told(refused, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize("launcher", distributed.RANKS)
 @pytest.mark.parametrize("arguments", ["train", "rehearse", "evaluate-fit --recording a.npz"])
 def test_what_is_not_shared_is_done_by_the_first_process_alone(monkeypatch, launcher: str, arguments: str) -> None:
-    """It met the others, who did nothing: brax failed or hung, and so did replays that all were to share."""
+    """Regression: it connected to the others, which did nothing, so that brax and shared replays failed or hung."""
     did = list[str]()
     actions = dict.fromkeys(run._ACTIONS, lambda command: did.append(os.environ[launcher]))
     monkeypatch.setattr(run, "_ACTIONS", actions)
@@ -130,7 +130,7 @@ def test_what_is_not_shared_is_done_by_the_first_process_alone(monkeypatch, laun
 
 
 def test_several_processes_do_not_train(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They found it out after hours of search, where brax hung or failed."""
+    """Regression: brax hung or failed after hours of search."""
     needs_one_process(All())  # of one
     monkeypatch.setattr(distributed, "_place", [0, 2])
     with pytest.raises(ValueError, match="give --stages identify gap, then train in one process"):

@@ -1,4 +1,4 @@
-"""README.md and docs/: links, paths, the length of sentences, and what they repeat of the program."""
+"""README.md and docs/: links, paths, the length of sentences, and agreement with the program."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_link_that_leads_nowhere_is_seen():
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name)
 def test_no_document_holds_what_a_program_said_beside_its_answer(document: Path):
-    """Two lines about warp once stood between a heading and its table, which then was none."""
+    """Regression: two lines about warp stood between a heading and its table and broke the table."""
     assert "Failed to import" not in document.read_text()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from droid_jax.installation import MEND, MixedInstallation, check_files_of, check_mujoco
+from droid_jax.installation import REINSTALL, MixedInstallation, check_files_of, check_mujoco
 
 ROOT = Path(__file__).resolve().parents[1]
 THREE, FOUR = {"mujoco": "3.17.0"}, {"mujoco": "4.0.0", "mujoco-core": "4.0.0", "mujoco-studio": "4.0.0"}
@@ -45,7 +45,7 @@ def test_two_versions_are_named_with_the_command_that_mends_it(
         library(tmp_path, version)
     with pytest.raises(MixedInstallation, match=said) as error:
         check_files_of(tmp_path, versions)
-    assert MEND in str(error.value) and str(tmp_path) in str(error.value)
+    assert REINSTALL in str(error.value) and str(tmp_path) in str(error.value)
 
 
 def test_a_command_ends_with_that_sentence(tmp_path: Path):
@@ -57,5 +57,5 @@ def test_a_command_ends_with_that_sentence(tmp_path: Path):
     command = [sys.executable, "-m", "droid_jax.run", "identify"]
     environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": ""}
     run = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
-    assert run.returncode == 2 and "9.9.9" in run.stderr and MEND in run.stderr
+    assert run.returncode == 2 and "9.9.9" in run.stderr and REINSTALL in run.stderr
     assert "Traceback" not in run.stderr and "imported" not in run.stderr

@@ -62,7 +62,7 @@ def imports(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[
 
 
 def layer_fault(path: str, imported: str) -> str | None:
-    """What is wrong with a file (relative to the package, "model/scene.py") importing a name, if anything."""
+    """Fault of a file (relative to the package, "model/scene.py") that imports a name; None where it may."""
     parts = imported.split(".")
     if parts[0] != "droid_jax":
         homes = ONLY_IN.get(parts[0])
@@ -109,7 +109,7 @@ def names_of_mjx_internals(source: str) -> set[str]:
 
 
 def test_mjx_internals_are_named_in_one_module():
-    """Another MuJoCo is one file's work."""
+    """So that another version of MuJoCo needs changes in one file only."""
     found = {f.relative_to(PACKAGE).as_posix(): names_of_mjx_internals(f.read_text()) for f in PACKAGE.rglob("*.py")}
     assert [path for path, names in found.items() if names] == ["model/mjx_internals.py"]
 
@@ -154,7 +154,7 @@ def looked_up(source: str, names: set[str]) -> set[str]:
 
 
 def test_generic_layers_know_parameters_by_role():
-    """What a parameter is, `Parameter.role` says; its name is for people."""
+    """`Parameter.role` states what a parameter is; its name is only for the user."""
     names = parameter_names()
     assert {"hinge_preload", "payload_mass", "sliding_friction_left", "time_offset", "torque_offset"} <= names
     found = {

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 
 def run(*command: str, cwd: Path = ROOT) -> str:
-    """Output of a command of this Python; a failure shows what it said."""
+    """Output of a command of this Python; a failure shows its messages."""
     done = subprocess.run([sys.executable, *command], cwd=cwd, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

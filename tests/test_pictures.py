@@ -1,4 +1,4 @@
-"""The pictures of a fit: never an earlier one's beside a new one's numbers, and drawn later where they could not be."""
+"""The pictures of a fit: never those of an earlier fit beside new numbers, and drawn later where OpenGL was missing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_log_without_commands_leaves_no_pictures_of_an_earlier_fit(tmp_path: P
 
 
 def test_the_measured_motion_is_the_mean_of_what_was_measured(scene: Scene):
-    """On the replay's clock, joint by joint; a joint that was not measured stands as it was simulated."""
+    """On the replay's clock, joint by joint; a joint that was not measured has its simulated position."""
     joint, other = scene.joints[:2]
     clock = np.array([1.0, 2.0, 3.0])
     values = np.array([[[0.0], [1.0], [2.0]], [[0.0], [3.0], [9.0]]])

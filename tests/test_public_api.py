@@ -103,7 +103,7 @@ def test_an_unknown_name_is_refused():
 
 
 def test_a_public_name_is_a_module_or_a_function():
-    """Importing a module hangs it into the package under its name, where it would replace a function."""
+    """Importing a module sets it as an attribute of the package, where it would replace a function of that name."""
     assert not {*dj.__all__} & {p.stem for p in (ROOT / "droid_jax").iterdir()}
 
 
@@ -156,7 +156,7 @@ def test_the_example_recovers_the_arm(example: ModuleType, recording: dj.Recordi
 
 @pytest.mark.slow
 def test_the_example_runs_as_a_script(example: ModuleType, tmp_path: Path):
-    """A process of its own, with the default settings."""
+    """A separate process, with the default settings."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     run = subprocess.run(
         [sys.executable, str(EXAMPLE)], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
@@ -184,7 +184,7 @@ def blocks(document: str, language: str) -> list[str]:
 
 @pytest.fixture
 def workplace(tmp_path: Path, recording: dj.Recording, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with what the documents call my_robot.xml and my_log.npz; small budgets, jax tuned already."""
+    """A folder with my_robot.xml and my_log.npz of the documents; small budgets, jax already tuned."""
     shutil.copy(EXAMPLE.with_suffix(".xml"), tmp_path / "my_robot.xml")
     dj.save_recording(recording, tmp_path / "my_log.npz")
     monkeypatch.chdir(tmp_path)
@@ -249,7 +249,7 @@ def test_the_command_of_your_robot_runs(workplace: Path):
 
 
 def test_the_documented_effect_is_one(monkeypatch: pytest.MonkeyPatch):
-    """The example is registered, found for the door, pushes it open, and is gone again."""
+    """The example is registered, is a candidate for the door, pushes it open, and is removed again."""
     registry.registered()  # modules register once: before the list is replaced
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
     (code,) = blocks("docs/your-effect.md", "python")

@@ -1,4 +1,4 @@
-"""One name, one thing; and what `pdoc` and an editor show of it."""
+"""Public names are unique, and have docstrings for `pdoc` and editors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_module_says_what_it_holds():
 
 @pytest.mark.parametrize("name", dj.__all__)
 def test_a_public_name_says_what_it_takes_and_gives(name: str):
-    """Google style, as pdoc and editors read it: every argument, what comes back, what is refused."""
+    """Google style, as pdoc and editors read it: arguments, return value, errors."""
     public = getattr(dj, name)
     text = inspect.getdoc(public) or ""
     first, *rest = text.split("\n")

@@ -1,4 +1,4 @@
-"""The reader of JSON: bounded, strict, and its errors say where."""
+"""The reader of JSON: bounded, strict, and its errors name the place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`all`: its stages, what they are given, and what is not run again."""
+"""`all`: its stages, their input, and stages that are not run again."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_a_policy_is_trained_on_the_extended_model_where_there_is_one(called, tm
 
 
 def test_where_no_policy_can_be_trained_the_run_ends_with_the_search(called, tmp_path: Path, capsys):
-    """It ended with an error of the environment, after the search."""
+    """Regression: it ended with an error of the environment after the search."""
     scene, folder = door_scene(), tmp_path / "runs" / "all" / "gap"
     effects = library(scene, ("profile_acceleration",))
     location, names = next(iter(effects[0].locations.items()))
@@ -182,7 +182,7 @@ def test_where_no_policy_can_be_trained_the_run_ends_with_the_search(called, tmp
 
 @pytest.mark.parametrize("synthetic_robot", [True, False])
 def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_path: Path, capsys, synthetic_robot: bool):
-    """Recordings of a synthetic robot may lie beside a search in a robot's own."""
+    """The folder may hold recordings of a synthetic robot although real recordings were searched."""
     found(tmp_path / "runs" / "all" / "gap", ["latch"], synthetic_robot)
     assert main([]) == 0
     said = capsys.readouterr().out
@@ -191,7 +191,7 @@ def test_the_last_lines_say_what_was_hidden_in_what_was_searched(called, tmp_pat
 
 @pytest.mark.parametrize("robot", [{}, {"springs": 1, "seed": 0}])
 def test_a_success_on_another_robot_than_the_fitted_one_is_no_promise(called, tmp_path: Path, capsys, robot: dict):
-    """The policy of a fit of your own recordings is tried on the synthetic robot all the same."""
+    """The policy of a fit of real recordings is also tried on the synthetic robot."""
     folder = tmp_path / "runs" / "all" / "train"
     folder.mkdir(parents=True)
     trials = {"success_rate": 1.0, "interval_95": [0.9, 1.0]}
@@ -226,7 +226,7 @@ def test_a_stage_with_other_inputs_is_run_again(called, monkeypatch: pytest.Monk
 
 
 def test_a_policy_that_was_made_with_other_options_is_kept(called, monkeypatch: pytest.MonkeyPatch, capsys):
-    """It may have taken hours, and none of the stages that are checked beforehand is among these."""
+    """It may have taken hours, and is not among the stages that are checked beforehand."""
 
     def other(command: train.Train) -> None:
         called.append(command)
@@ -239,7 +239,7 @@ def test_a_policy_that_was_made_with_other_options_is_kept(called, monkeypatch: 
 
 
 def test_what_a_stop_leaves_unreached_is_not_taken_for_this_runs_later(called, monkeypatch, tmp_path: Path):
-    """`all --again`, stopped in its first stage, goes on without --again."""
+    """`all --again`, stopped in its first stage, is continued without --again."""
     stages = {"identify": "config.json", "gap": "gap.json", "train": "training.json"}
     for stage, last in stages.items():
         for name in (last, "setup.json", "checkpoints/0"):
@@ -318,11 +318,11 @@ def test_a_damaged_file_is_named(called, tmp_path: Path, name: str, text: str):
         if name == "all.json":
             all_stages._remember(all_stages.All(), run)
         else:
-            all_stages.told(run)
+            all_stages.summary_lines(run)
 
 
 def test_another_runs_results_are_not_written_over(called, capsys):
-    """They may have taken hours; what is left out, or tried more often, makes no other run."""
+    """They may have taken hours; omitted stages and more trials do not make it another run."""
     assert main(["all", "--preset", "paper"]) == 0
     assert main(["all", "--preset", "paper", "--stages", "identify", "gap"]) == 0
     assert main(["all", "--preset", "paper", "--trials", "7"]) == 0
@@ -369,7 +369,7 @@ def test_your_own_recordings_know_no_synthetic_robot(called, tmp_path: Path):
 
 
 def test_a_synthetic_robot_left_over_in_the_folder_is_not_the_robot_of_your_recordings(tmp_path: Path, monkeypatch):
-    """`all` made recordings of its own before: the same names do not make them those of the fit."""
+    """`all` made other recordings before; the same names do not make them those of the fit."""
     monkeypatch.chdir(tmp_path)
     made, stage = tmp_path / "recordings", tmp_path / "identify"
     made.mkdir()
@@ -413,7 +413,7 @@ def test_options_of_stages_that_are_left_out_are_refused(called, refused):
 def test_a_folder_of_identify_is_no_folder_of_all(called, refused, tmp_path: Path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "setup.json").write_text('{"preset": "quick"}')
-    assert "holds a run of `identify` itself" in refused("all", "--out", "mine")
+    assert "holds a run of `identify`, and the page would show both" in refused("all", "--out", "mine")
     assert called == []
 
 
@@ -502,7 +502,7 @@ def test_presets_reach_the_stages(called, capsys):
 
 
 def test_jax_is_tuned_before_the_synthetic_robot_is_recorded(tmp_path: Path):
-    """In a process of its own, where nothing has started jax: it could not be tuned afterwards."""
+    """In a separate process, where nothing has started jax, which could not be tuned afterwards."""
     code = (
         "from droid_jax.commands import all_stages, identify, synthetic\n"
         "from droid_jax.report import page\n"

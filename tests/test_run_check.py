@@ -1,4 +1,4 @@
-"""`check`: what it prints and writes, with a scene and without."""
+"""`check`: its output and files, with a scene and without."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_wrong_unit_is_on_the_terminal_in_the_page_and_in_the_json(
     assert "in degrees" in page and "<svg" in page and "shoulder" in page
     assert main(["check", "--recording", str(path), "--out", str(out)]) == 0  # again, without a scene
     assert ("units", "certain") not in found(out)
-    assert "Without a scene: units, signs and gains were not judged" in (out / "check.html").read_text()
+    assert "Without a scene: units, signs and gains were not checked" in (out / "check.html").read_text()
 
 
 def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):
@@ -84,7 +84,7 @@ def test_commands_that_the_scene_lacks_are_said(tmp_path: Path, scene: Path, cap
 
 
 def test_a_scene_for_plain_c_alone_is_looked_at_too(tmp_path: Path, scene: Path):
-    """It was refused, and `identify --engine mujoco` takes it."""
+    """Regression: it was refused, although `identify --engine mujoco` accepts it."""
     scene.write_text(scene.read_text().replace("<option ", '<option cone="elliptic" '))
     path = save_recording(wave(), tmp_path / "wave.npz")
     out = tmp_path / "check"
@@ -157,7 +157,7 @@ def test_what_a_motion_tells_and_what_would_tell_the_rest(
     assert open_ones == {"elbow_damping"} == {*excitation["identifiable_by_it"]} and excitation["left_open"] == []
     assert excitation["addition"]
     said = " ".join(capsys.readouterr().out.split())
-    assert "What these recordings tell of the parameters" in said and "also record" in said
+    assert "Identifiability of the parameters" in said and "also record" in said
     assert excitation["sentence"] in (out / "check.html").read_text()
     table = np.genfromtxt(out / "addition.csv", delimiter=",", names=True)
     assert table.dtype.names == ("time", *JOINTS)
@@ -180,7 +180,7 @@ def with_open_parameters(scene: Scene) -> tuple[Space, Excitation]:
 
 
 def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
-    """A hand was said to hold an object in any case; a replay that failed took all that was found with it."""
+    """Regression: a grasped object was given as the reason in any case, and a failed replay lost all findings."""
     servos = arm()
     space, found = with_open_parameters(servos)
     spec = servos.spec.copy()
@@ -206,7 +206,7 @@ def test_why_no_motion_is_proposed_is_said(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
-    """The largest jump was 1.5 times what was said, and no limit was looked at."""
+    """Regression: the largest step was 1.5 times the stated one, and torque limits were ignored."""
 
     def jump(scene: Scene, log: Recording) -> float:
         (steps,) = (a for a in additions(scene, log) if a.what.startswith("steps of elbow"))
@@ -223,7 +223,7 @@ def test_steps_are_no_larger_than_said_and_stay_within_the_torque_limit():
 
 
 def test_a_beginning_that_stands_still_is_looked_at_for_longer():
-    """Of such a log the way to half of its range was left alone, and counted for all of it."""
+    """Regression: of a log that begins at rest, only motion up to half of its range was used."""
     time = np.arange(0.0, 60.0, 0.01)
     went = 0.3 * np.sin(np.maximum(time - 19.0, 0.0))[:, None] * np.ones(2)
     log = recording(time=time, command=went, channels=recording().channels)
@@ -233,7 +233,7 @@ def test_a_beginning_that_stands_still_is_looked_at_for_longer():
 
 
 def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing():
-    """It was sent through 90 % of its whole range."""
+    """Regression: it was moved through 90 % of its whole range."""
     xml = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-2 2" limited="true"/>
     <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "slide", joints=["x"])

@@ -1,4 +1,4 @@
-"""The command `gap`: bad input ends in one sentence, a run goes on after a stop, and its folder is whole."""
+"""The command `gap`: bad input ends in one sentence, a stopped run can be continued, and its folder is complete."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def test_good_recordings_are_not_refused():
 
 
 def test_a_hinge_that_opens_downwards_is_refused():
-    """Half of the library would be neutral on it, without a word."""
+    """Half of the library would have no effect on it, without a message."""
     scene, recording = replace(small_scene()[0], object_joint="door"), record("train")
     angle = recording.channels["object_angle"]
     turned = replace(recording, channels={**recording.channels, "object_angle": replace(angle, values=-angle.values)})
@@ -313,7 +313,7 @@ def test_hiding_is_for_the_synthetic_robot(place: Path, refused):
 
 
 def test_effects_of_ones_own_are_asked_about_like_the_others(place: Path, refused, monkeypatch: pytest.MonkeyPatch):
-    """The one that docs/your-effect.md shows."""
+    """The effect of docs/your-effect.md."""
     registry.registered()
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "your-effect.md").read_text(), re.M | re.S)
@@ -353,7 +353,7 @@ def test_what_is_hidden():
 
 
 def test_the_synthetic_robot_records_each_demonstration_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """C is fitted, B confirms, A stays sealed; nothing in the files says what was hidden."""
+    """C trains, B validates, A is the test recording; no file shows the hidden effect."""
     from droid_jax.synthetic import hidden_effects as hidden
 
     asked = []
@@ -395,7 +395,7 @@ def fit_json(folder: Path, **values: float) -> Path:
 
 
 def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
-    """No search, the known values (within bounds) as the one start, and what the fit does not know at its mean.
+    """No search; the only start has the known values (within bounds), and other parameters at their means.
 
     The folder may be one of `all`.
     """
@@ -429,7 +429,7 @@ def test_a_fit_that_is_none_or_of_another_model(place: Path, quick: None, refuse
 def test_a_run_goes_on_after_a_stop_and_is_whole(
     place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], refused
 ):
-    """Killed in the search; then begun again with every replay of the base fit remembered; then finished."""
+    """Killed in the search; then started again without replays of the base fit; then finished."""
     pytest.importorskip("tensorboardX")
     command = arguments(place, "--effects", *EFFECTS, "--tensorboard")
     find = missing.search_effects
@@ -506,7 +506,7 @@ def tied(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
-    """The command asks what would tell the rivals apart, on the fitted recording."""
+    """The command computes which experiment would distinguish the alternatives, on the fitted recording."""
     asked = []
 
     def apart(case, models, recording):
@@ -528,7 +528,7 @@ def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pyt
 def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
     place: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Stopped while candidate experiments are made; gone on with, where these fail and the final refit is made."""
+    """Stopped during the candidate experiments; then continued, where these fail and the final refit is made."""
     command, out = arguments(place, "--effects", *EFFECTS), place / "run"
     tied(monkeypatch)
 
@@ -565,7 +565,7 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
 
 @pytest.mark.slow
 def test_the_command_as_a_user_runs_it(place: Path):
-    """A process of its own: every file and the page; then the parameters once more, with the effect in the model."""
+    """In a separate process: every file and the page; then the parameters once more, with the effect in the model."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
 
     def run(*words: str) -> str:
@@ -595,7 +595,7 @@ def test_the_command_as_a_user_runs_it(place: Path):
 
 
 def test_help_is_quick():
-    """It loads nothing that takes time."""
+    """It imports nothing that takes time."""
     code = (
         "import sys\nfrom droid_jax.run import main\n"
         "try:\n    main(['gap', '--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("one_line", "tuned")
 
 
 def command(place: Path, recordings: Sequence[Recording], *options: str) -> list[str]:
-    """A whole command line about the elbow."""
+    """A command line for the elbow."""
     for k, recording in enumerate(recordings):
         save_recording(recording, place / f"{k}.npz")
     files = [str(place / f"{k}.npz") for k in range(len(recordings))]
@@ -69,12 +69,12 @@ def test_halves_are_the_first_and_the_last_repeats():
 
 
 def blind(count: int) -> Recording:
-    """Commanded, its positions not measured: no window could begin."""
+    """A commanded log without measured positions, in which no window can begin."""
     recording = with_repeats(count)
     return replace(recording, channels={"torque": recording.channel("torque")})
 
 
-WINDOWS = "in which positions were measured are searched by stretches"
+WINDOWS = "in which positions were measured are searched in windows of time"
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ WINDOWS = "in which positions were measured are searched by stretches"
         ([blind(15)], ["is the only one and has 15 repeats", "Record 16 or more", "droid_jax.run identify", WINDOWS]),
         ([blind(1)], ["is the only one and has 1 repeat:", "another motion, 8 repeats or more of each"]),
         ([blind(3)] * 2, ["the train recording 'servo' has 3 repeats:", WINDOWS]),
-        ([elbow_log(0.0, 2.0, repeats=2)], ["has 2 repeats", "one repeat alone is searched as a log"]),
+        ([elbow_log(0.0, 2.0, repeats=2)], ["has 2 repeats", "a single repeat is searched in blocks of time"]),
         ([LOG, elbow_log(0.0, 2.0, repeats=3)], ["the second recording 'elbow' has 3 repeats", "Leave the second out"]),
         ([LOG, with_repeats(1)], ["the second recording 'servo' has commands", "log without repeats and commands"]),
         ([LOG] * 3, ["the train recording 'elbow' has 1 repeat:", "fewer than 8", "droid_jax.run identify"]),
@@ -98,7 +98,7 @@ def test_too_few_repeats_say_what_can_still_be_done(recordings: list[Recording],
 
 
 def test_commanded_logs_with_few_repeats_are_cut_into_windows():
-    """Any number of them, of any number of repeats that is too small to be flipped; others may judge."""
+    """Any number of logs with too few repeats for sign flips; further ones may be test data."""
     one, three = with_repeats(1), with_repeats(3)
     for recordings in ([one], [three], [with_repeats(15)], [one] * 5, [with_repeats(8), three], [with_repeats(8)] * 4):
         assert split_of(recordings) is Split.WINDOWS
@@ -106,7 +106,7 @@ def test_commanded_logs_with_few_repeats_are_cut_into_windows():
     roles = roles_of(Split.WINDOWS, [one, three], [with_repeats(2)])
     assert list(roles) == ["train", "train 2", "test"]
     assert pooled(roles, "train") == [one, three] and pooled(roles, "test") == [roles["test"]]
-    with pytest.raises(ValueError, match="to judge on are for commanded logs whose positions were measured"):
+    with pytest.raises(ValueError, match=r"test recordings .* are for commanded logs whose positions were measured"):
         split_of([LOG], [one])
 
 
@@ -161,7 +161,7 @@ def test_a_log_is_searched_and_its_limits_are_said(run: tuple[Path, str], found:
     lines = run[1].splitlines()[-7:]
     assert lines[0] == "The model lacks: joint_coulomb at elbow."
     assert "closed), test " in lines[3] and lines[4] == Split.BLOCKS.limits == found.found.split.limits
-    assert found.found.split.by == "blocks" and "nothing tells a place from noise" in lines[4]
+    assert found.found.split.by == "blocks" and "localisation cannot be distinguished from noise" in lines[4]
     (amplitude,) = found.found.coefficients
     assert amplitude.low < COULOMB < amplitude.high and amplitude.value == pytest.approx(COULOMB, rel=0.1)
     assert found.found.discretisation_error == 0.0 and set(found.found.seconds) == {"preparation", *IN_BLOCKS}
@@ -200,7 +200,11 @@ def test_what_a_log_lacks_is_handed_on(run: tuple[Path, str]):
 
 def test_the_page_of_a_log_claims_no_repeats(run: tuple[Path, str]):
     page = (run[0] / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
-    assert "nothing tells a place from noise" in page and "noise included" in page and "less, and what is left" in page
+    assert (
+        "localisation cannot be distinguished from noise" in page
+        and "noise included" in page
+        and "less; the remaining U includes" in page
+    )
     for untrue in (
         "repeats' mean",
         "one repeat's noise",

@@ -1,4 +1,4 @@
-"""The command `gap` on positions alone: of repeats, and of one commanded log by stretches of time."""
+"""The command `gap` on positions alone: of repeats, and of one commanded log in windows of time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ASKED = ("joint_coulomb", "cable_pull", "command_delay")
 
 
 def found(place: Path, recordings: Sequence[Recording], *options: str) -> Found:
-    """What the command finds in the pendulum's recordings; its page is there."""
+    """The command's answer for recordings of the pendulum; its page exists."""
     for recording in recordings:
         save_recording(recording, place / f"{recording.name}.npz")
     files = [str(place / f"{r.name}.npz") for r in recordings]
@@ -54,13 +54,13 @@ def test_positions_of_repeats(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_positions_of_one_commanded_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Beside it: whole replays, and another log that judges."""
+    """With replays of whole motions, and a test recording."""
     monkeypatch.setattr(made, "SECONDS", 18.0)
     logs = [swung("log", 1.0, 0.31, noise=NOISE, friction=FRICTION)]
     judge = swung("judge", 0.8, 0.43, noise=NOISE, friction=FRICTION)
     save_recording(judge, tmp_path / "judge.npz")
-    answer = found(tmp_path, logs, "--judge-on", str(tmp_path / "judge.npz"))
-    assert answer.split.by == "windows" and "stretches of time" in answer.split.limits
+    answer = found(tmp_path, logs, "--test-recording", str(tmp_path / "judge.npz"))
+    assert answer.split.by == "windows" and "windows of time" in answer.split.limits
     assert [d.recording for d in answer.discrepancies.values()] == [
         "log, every other block", "log, the blocks between", "judge",
     ]  # fmt: skip

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from droid_jax.commands.evaluate import Evaluate, _film, _robot, _task, _tell
+from droid_jax.commands.evaluate import Evaluate, _film, _print_trials, _robot, _task
 from droid_jax.commands.folder import begin, setup_of, stage_folder
 from droid_jax.commands.source import source, synthetic_robot_of
 from droid_jax.commands.train import Train, _fit_folder
@@ -52,10 +52,10 @@ def fit(folder: Path, door, **setup) -> Path:
 
 
 def test_a_fit_that_is_not_whole_is_refused(scene, tmp_path: Path):
-    """Started over and stopped: what lies there is of the run before."""
+    """After --again and a stop, the folder holds results of the earlier run."""
     folder = fit(tmp_path, scene, springs=2, seed=7, recording=[])
     (folder / "config.json").unlink()
-    with pytest.raises(ValueError, match="holds a run that is not whole"):
+    with pytest.raises(ValueError, match="holds a run that is not complete"):
         source(folder, knob=0)
 
 
@@ -68,7 +68,7 @@ def test_a_fit_brings_its_gaussian_and_its_synthetic_robot(scene, tmp_path: Path
 
 
 def test_a_policy_meets_the_nuisances_of_its_fit(scene, tmp_path: Path):
-    """They were left out: where the door stands and what the links weigh stayed nominal in training."""
+    """Regression: the door's pose and the links' masses stayed nominal in training."""
     without = fingerprint(fit(tmp_path, scene))
     full = prior(door_space(scene) + door_nuisances(scene))
     full = replace(full, mean=np.full(len(full.space), 0.1))
@@ -86,14 +86,14 @@ def test_fits_for_another_servo_or_scene_are_refused(scene, tmp_path: Path):
 
 
 def test_a_fit_with_effects_of_the_library_is_refused(scene, tmp_path: Path):
-    """It was said to be of another scene."""
+    """Regression: the message was about another scene."""
     fit(tmp_path, scene, effects=["latch"])
     with pytest.raises(ValueError, match=r"with --effects latch, .*a folder of `gap`, or on a fit with --extended"):
         source(tmp_path, knob=0)
 
 
 def test_a_gaussian_that_came_without_its_setup_is_known_by_its_parameters(scene, tmp_path: Path):
-    """Its entries exist in the door's model too, and mean other joints there."""
+    """Its parameters exist in the door's model too, but for other joints."""
     fit(tmp_path, scene)
     whole = json.loads((tmp_path / "gaussian.json").read_text())
     for what, said in (
@@ -240,11 +240,11 @@ def test_which_fit_is_trained_on(tmp_path: Path, there: list[str], named: bool, 
 
 
 class Killed(RuntimeError):
-    """What a kill is to a test."""
+    """Stands for a kill in a test."""
 
 
 def test_a_killed_training_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """brax's PPO is played; checkpoints, resuming and what is written in the end are the command's own."""
+    """brax's PPO is played; checkpoints, resuming and final files are those of the command."""
     from droid_jax.policy import train as module
 
     asked = list[tuple[int, bool]]()
@@ -319,7 +319,7 @@ def test_trials_on_another_robot_than_the_fitted_one_say_so(fit: str | None, rob
     task = {"opened": 0.7, "held": 1.0, "control": 0.02, "steps": 512}
     training = {"setup": {"method": "fitted", "preset": "quick", "knob": 0, "seed": 0, "fit": fit}, "task": task}
     training |= {"synthetic_robot": robot, "scene": "door", "effects": [], "versions": {}, "device": "", "history": []}
-    _tell(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
+    _print_trials(Trained(Path(), msgspec.convert(training, Training), msgspec.convert(tried, Transfer), {}))
     said = capsys.readouterr().out
     assert "synthetic robot: 100 % success" in said
     assert ("The fit is of your own recordings: the synthetic robot is another one" in said) == another

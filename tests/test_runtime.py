@@ -188,7 +188,7 @@ def test_mesh_spans_all_devices_of_the_process():
 
 
 def test_products_are_exact_unless_the_user_decided(tmp_path):
-    """In processes of their own: the setting is the whole program's."""
+    """In separate processes, because the setting is that of the whole program."""
     code = "from droid_jax import runtime; runtime.tune(); import jax; print(jax.config.jax_default_matmul_precision)"
     for given, expected in ({}, "highest"), ({"JAX_DEFAULT_MATMUL_PRECISION": "tensorfloat32"}, "tensorfloat32"):
         environment = {**os.environ, runtime.CACHE_VARIABLE: str(tmp_path), **given}
@@ -333,14 +333,14 @@ assert any(found) is {warm}
 @pytest.mark.slow
 @pytest.mark.parametrize("first", ["", "import jax", "import jax.numpy; import mujoco", "import droid_jax.model.step"])
 def test_it_prints_nothing_even_with_a_warm_cache(tmp_path: Path, first: str):
-    """XLA has 2 kB to say of every program that it loads; whether jax or this package was imported first."""
+    """XLA prints 2 kB about every program that it loads, whether jax or this package was imported first."""
     for warm in (False, True):
         done = fresh(FIRST_COST.format(first=first, cache=str(tmp_path), warm=warm))
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_other_messages_of_the_cache_are_not_hidden(tmp_path: Path):
-    """What is no known message comes through, and so does what a program prints itself."""
+    """Unknown messages and the program's own output are printed."""
     code = """
 import os, re, sys
 from droid_jax.quiet import _OF_THE_CACHE, _without

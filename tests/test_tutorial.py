@@ -1,4 +1,4 @@
-"""The tutorial runs start to end on the data that ship with it, and finds what its data hold."""
+"""The tutorial runs from start to end on its data, and finds the effects in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`view`: what it would show, and what it says where it cannot."""
+"""`view`: the models it shows, and its messages where it cannot show them."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_without_a_path_it_shows_what_the_default_command_left(
 
 
 def test_the_page_is_served_until_it_is_interrupted(monkeypatch: pytest.MonkeyPatch, capsys):
-    """At this machine's own address, at a free port, whatever path is asked for."""
+    """At the local address and a free port, for every requested path."""
     servers = list[ThreadingHTTPServer]()
 
     class Kept(ThreadingHTTPServer):

@@ -55,7 +55,7 @@ def test_a_second_run_is_refused_at_once(refused: Callable[..., str], holder, tm
     process = holder(tmp_path / "run")
     said = refused(command, "--out", tmp_path / "run")
     assert said == (
-        f"error: another run writes to {tmp_path / 'run'} (process {process.pid}): wait for its end, or choose "
+        f"error: another run writes to {tmp_path / 'run'} (process {process.pid}): wait until it ends, or choose "
         "another --out"
     )
 
@@ -225,7 +225,7 @@ def test_a_page_of_somebody_else_stays(tmp_path: Path):
 
 
 def test_what_was_exported_and_then_changed_stays(tmp_path: Path):
-    """The loop on a robot's computer is made to be changed."""
+    """The control loop for a robot's computer is meant to be changed by the user."""
     write_own(tmp_path / "out", {"control.py": b"one", "policy.npz": b"1"})
     write_own(tmp_path / "out", {"control.py": b"two", "policy.npz": b"2"})
     (tmp_path / "out" / "control.py").write_bytes(b"mine")

@@ -1,1 +1,1 @@
-"""Commands of the program: each parses its options, calls the layers above, and writes a folder."""
+"""The commands of the program. Each parses its options, calls the layers above, and writes a folder."""

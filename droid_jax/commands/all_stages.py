@@ -1,4 +1,4 @@
-"""`all`: from a recording to a policy, stage by stage, with one page for everything."""
+"""`all`: every stage from a recording to a policy, with one page."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from droid_jax.storage import write_json
 
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
-IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # of your own: policies are trained at the built-in door
+IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # stages for your own scene; policies need the built-in door
 
 
 class _Presets(NamedTuple):
-    """What a preset means to the stages."""
+    """The presets of the stages that a preset of `all` selects."""
 
     identify: Literal["quick", "standard", "gpu"]
     train: Literal["quick", "paper", "gpu"]
@@ -48,63 +48,64 @@ PRESETS = {
 }
 
 MINUTES = {"record": 0.3, "identify": 4.0, "gap": 7.5, "train": 6.0, "evaluate": 1.1}
-"""Of each stage in the preset "quick", on two cores with nothing compiled before (benchmarks/default_run.py)."""
+"""Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
 @dataclass(frozen=True)
 class All:
-    """Everything: record, identify, search for what the model lacks, train a policy, try it, and one page.
+    """Run all stages: record, identify, search for missing effects, train a policy, test it; with one page.
 
-    Without --recording a synthetic robot is recorded that hides an effect.  A stage whose inputs are as they were is
-    not run again.
+    Without --recording a synthetic robot with a hidden effect is recorded.  A stage with unchanged inputs is not run
+    again.
     """
 
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """quick: identify, gap and train with their own quick; a laptop, half an hour.  paper: identify and gap with
-    standard (100 generations; not identify's paper, whose servo no policy can be trained on), train with paper; hours.
-    gpu: all with gpu."""
+    """quick: preset quick in identify, gap and train; half an hour on a laptop.  paper: standard in identify and gap
+    (100 generations; no policy can be trained with the servo of identify's preset paper), paper in train; hours.  gpu:
+    gpu in all stages."""
     recording: tuple[Path, ...] = ()
-    """TRAIN VALIDATION [TEST], ONE or LOG [TEST], as in gap; with fewer repeats: --stages identify."""
+    """TRAIN VALIDATION [TEST], ONE or LOG [TEST], as in gap. With fewer repeats use --stages identify."""
     scene: Path | None = None
-    """Your own MJCF instead of the built-in door: identify and gap, policies are trained at the built-in one."""
+    """Your own MJCF instead of the built-in door, for identify and gap; policies are trained at the built-in door."""
     parameters: Path | None = None
     """JSON list of the parameters of your own scene (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
-    """Joint of the thing that is moved, in your own scene."""
+    """Joint of the object that is moved, in your own scene."""
     joint_friction: JointFriction = "held"
-    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
-    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
+    """Dry friction of your own scene's joints. held: a stiffer constraint, with which friction holds a load still,
+    unless the MJCF sets solimpfriction or solreffriction itself. scene: the MJCF's constraint, whose default lets
+    joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     hide: tuple[str, ...] | None = None
-    """What the synthetic robot hides, name=amplitude; none for nothing. Default: magnetic_catch=1.5 (N m)."""
+    """Hidden effect of the synthetic robot, name=coefficient; none for no effect. Default: magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None
     """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
     """Seed of every stage and of the synthetic robot."""
     force: bool = False
-    """Fit recordings too of which no fit can mean anything (`check`: certain); the report says so."""
+    """Also fit recordings with a certain finding of `check`, whose fit would be meaningless; the report says so."""
     trials: int = 100
-    """Trials of the policy on the synthetic robot, and episodes in simulation."""
+    """Number of trials of the policy on the synthetic robot, and of episodes in simulation."""
     stages: tuple[Stage, ...] = STAGES
-    """Which stages; those left out are read from the folder where they are in it."""
+    """Stages to run; results of the others are read from the folder, if it has them."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it fits and trains, to OUT/identify/tensorboard and so on."""
     out: Path = Path("runs/all")
-    """Results folder, with one folder for each stage. A run that was interrupted goes on from where it was."""
+    """Results folder, with one folder for each stage. An interrupted run continues."""
     again: bool = False
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
 @writes("all")
 def run(command: All) -> None:
-    """Every stage in a folder of its own below OUT, then the page of all of them; where one fails, of those before."""
+    """Run every stage in its own folder below OUT, then write one page; if a stage fails, a page of those before."""
     started = time.monotonic()
     from droid_jax import runtime
     from droid_jax.report.progress import needs_writer
@@ -116,10 +117,10 @@ def run(command: All) -> None:
     needs_writer(command.tensorboard)
     command = replace(command, stages=_stages(command))
     if "train" in command.stages:
-        needs_brax()  # rather now than after the search
+        needs_brax()  # before the search, which takes long
     if "evaluate" in command.stages:
         evaluate.needs_trials(command.trials)
-    runtime.start()  # before the recording, which would start jax untuned
+    runtime.start()  # before the recording, which would start jax without tune()
     from droid_jax.model.effects.registry import check_scale
 
     check_scale(command.effect_scale)
@@ -129,7 +130,8 @@ def run(command: All) -> None:
     out = command.out
     if {*IN_A_SCENE} & {*command.stages}:
         _remember(command, out)
-    if command.again:  # now: one that a stop leaves unreached is not to pass for this run's; the first does so itself
+    # Earlier results of later stages must not pass for results of this run if it is stopped before them.
+    if command.again:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
     _run_stages(command, out, roles)
@@ -137,13 +139,13 @@ def run(command: All) -> None:
 
     page = write_report(out)
     print(f"\n{command.out}: {(time.monotonic() - started) / 60:.0f} minutes")
-    for line in told(out):
+    for line in summary_lines(out):
         print(line)
     print(f"report: {page}")
 
 
 def _needs_stages(command: All) -> None:
-    """ValueError for options of the synthetic robot where no stage records one: they would change nothing."""
+    """ValueError for options of the synthetic robot if no stage records one."""
     given = [name for name in ("hide", "springs") if getattr(command, name) is not None]
     if given and not {*IN_A_SCENE} & {*command.stages}:
         raise ValueError(
@@ -153,16 +155,16 @@ def _needs_stages(command: All) -> None:
 
 
 def _remember(command: All, out: Path) -> None:
-    """Keep what was asked for; OtherRun where the folder holds what other options made, which may have taken hours.
+    """Write the options to all.json; OtherRun if the folder holds a run with other options, which may have taken hours.
 
-    Stages that are left out or added make no other run, nor do more trials, nor does a policy of what lies there.
+    Other stages and another number of trials do not count as other options.
     """
     asked = {k: v for k, v in setup_of(command).items() if k not in ("stages", "trials")}
     files = [*command.recording, *filter(None, (command.scene, command.parameters))]
     asked["files"] = [str(path.resolve()) for path in files]
     if own := setup(out):
         raise ValueError(
-            f"{out} holds a run of `{own.get('command', 'identify')}` itself, and the page would be of both: "
+            f"{out} holds a run of `{own.get('command', 'identify')}`, and the page would show both: "
             "give another folder (--out)"
         )
     path = out / ASKED
@@ -173,17 +175,17 @@ def _remember(command: All, out: Path) -> None:
 
 
 def _stages(command: All) -> tuple[Stage, ...]:
-    """The stages that were asked for, as far as the scene has them; ValueError where none is left."""
+    """The requested stages that the scene allows; ValueError if there are none."""
     possible = STAGES if command.scene is None else IN_A_SCENE
-    left: tuple[Stage, ...] = tuple(stage for stage in possible if stage in command.stages)
-    if not left:
+    chosen: tuple[Stage, ...] = tuple(stage for stage in possible if stage in command.stages)
+    if not chosen:
         why = "" if command.scene is None else " with --scene: policies are trained at the built-in door"
         raise ValueError(f"--stages must name one of {', '.join(possible)}{why}")
-    return left
+    return chosen
 
 
 def needs_one_process(command: All) -> None:
-    """ValueError where several processes would train: brax takes the devices of all of them."""
+    """ValueError if several processes would train: brax uses the devices of all of them."""
     if distributed.count() > 1 and "train" in _stages(command):
         raise ValueError(
             "a policy is trained by one process: give --stages identify gap, then train in one process "
@@ -192,10 +194,10 @@ def needs_one_process(command: All) -> None:
 
 
 def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
-    """Record where nothing was recorded, then the stages that were asked for; each says how long it took.
+    """Record the synthetic robot if no recording is given, then run the stages and print how long each took.
 
-    Where one fails, the page of those before it is written.  Where the search found an effect that no policy can be
-    trained with, they end with it.
+    If a stage fails, the page of those before it is written.  If the search named an effect with which no policy can be
+    trained, the run ends after it.
     """
     plan = _plan(command, out, command.recording or kept_at(out), roles)
     if _records(command):
@@ -219,19 +221,19 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
 
 
 def _left(command: All, stages: Sequence[str]) -> str:
-    """How long these stages take, in words, where that has been measured; each shows its own progress besides."""
+    """Text with the expected duration of these stages; empty for settings that were not measured."""
     if command.preset != "quick" or command.scene is not None or command.recording:
         return ""
     return f" (about {max(1, round(sum(MINUTES[stage] for stage in stages)))} min left on two cores)"
 
 
 def _records(command: All) -> bool:
-    """Whether the synthetic robot records: the stages after the search need no recording."""
+    """Whether the synthetic robot is recorded; the stages after the search need no recording."""
     return not command.recording and bool({*IN_A_SCENE} & {*command.stages})
 
 
 def _needs_robot(command: All) -> None:
-    """ValueError for a synthetic robot that there cannot be, rather now than when the folder says it was asked for."""
+    """ValueError for an impossible synthetic robot, before the folder is written."""
     from droid_jax.door.scene import door_scene
 
     if not _records(command):
@@ -247,14 +249,16 @@ def _needs_robot(command: All) -> None:
             check_playable(scene, applied)
         except ValueError as error:
             left = "identify gap" if "inner_profile" in {one.name for one in applied} else "identify gap train"
-            raise ValueError(f"{error}; or leave the trials away: --stages {left}") from None
+            raise ValueError(f"{error}; or run without trials: --stages {left}") from None
 
 
 def _roles(command: All) -> tuple[str, ...]:
-    """What each recording is for: "train", "validation" or "test".
+    """Role of each recording: "train", "validation" or "test".
 
-    Raises ValueError, before anything long begins, where the search could not use them.  Without the search there is
-    nothing to seal, unless a search could be made later.
+    Without the stage gap, roles are assigned if a later search could use the recordings; otherwise all are "train".
+
+    Raises:
+        ValueError: the stage gap cannot use the recordings.
     """
     if not command.recording:
         needs_log(command.motion_cutoff, ())
@@ -270,7 +274,7 @@ def _roles(command: All) -> tuple[str, ...]:
         refuse_certain(scene, given)
     try:
         _, roles = assigned_roles(scene, given)
-        if "gap" in command.stages:  # names that are taken are told now, and not after the fit
+        if "gap" in command.stages:  # refuses clashing names before the fit
             joined(base, gap.chosen_effects(own, scene, given))
     except ValueError:
         if "gap" in command.stages:
@@ -280,7 +284,7 @@ def _roles(command: All) -> tuple[str, ...]:
 
 
 def _own(command: All) -> dict[str, Any]:
-    """The options of recordings, a scene and effects of your own, which both stages with them take."""
+    """Options that the stages identify and gap share: your own scene, effects and recordings."""
     names = (
         "scene",
         "parameters",
@@ -297,18 +301,18 @@ def _own(command: All) -> dict[str, Any]:
 def _plan(
     command: All, out: Path, recordings: tuple[Path, ...], roles: tuple[str, ...]
 ) -> dict[str, Callable[[], None]]:
-    """The stages that were asked for."""
+    """Stage -> function that runs it, for the requested stages."""
     presets = PRESETS[command.preset]
     common: dict[str, Any] = {"seed": command.seed, "again": command.again, "user_effects": command.user_effects}
     own, board = _own(command) | common, {"tensorboard": command.tensorboard}
-    # Test data stay closed until the search opens them.
+    # Test data are not fitted.
     seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "test")
 
     def fit() -> None:
         _stage(identify.run, identify.Identify(presets.identify, seen, out=out / "identify", **board, **own))
 
     def search() -> None:
-        # A log in blocks of time has no validation recording, and its base fit needs no start.
+        # A log that is split into blocks has no validation recording, and its base fit needs no start.
         fit = out / "identify" if "validation" in roles and _fitted(out / "identify", command, recordings) else None
         scale = command.effect_scale
         _stage(
@@ -329,7 +333,7 @@ def _plan(
 
 
 def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
-    """Whether a folder of `identify` holds the fit of these recordings: made just now, or earlier of the same."""
+    """Whether a folder of `identify` holds a fit of these recordings, from this run or an earlier one."""
     if not (folder / FIT).is_file() or unfinished(folder):
         return False
     if "identify" in command.stages:
@@ -343,8 +347,8 @@ def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:
     return bool(hashes) and same_scene and [recording_at(p).sha256 for p in recordings[: len(hashes)]] == hashes
 
 
-def told(out: Path) -> list[str]:
-    """One line for each stage that has a result."""
+def summary_lines(out: Path) -> list[str]:
+    """One line for each stage with a result."""
     from droid_jax.report.gap_folder import read_answer
     from droid_jax.report.identify_folder import Distances, read_fit
     from droid_jax.report.policy_folder import read_rates, read_training
@@ -363,7 +367,7 @@ def told(out: Path) -> list[str]:
 
 
 def _record(command: All) -> None:
-    """Let the synthetic robot record its motions."""
+    """Record the motions of the synthetic robot."""
     from droid_jax.door.scene import door_scene
 
     assert command.springs is not None  # settled
@@ -374,9 +378,9 @@ def _record(command: All) -> None:
 
 
 def _stage(run_stage: Callable[[Any], None], command: Any) -> None:
-    """Run a stage, anew where its folder holds a run with other inputs.
+    """Run a stage; start it over if its folder holds a run with other inputs.
 
-    Raises OtherRun where it was asked for something else: that may have taken hours.
+    Raises OtherRun if that run had other options, since it may have taken hours.
     """
     try:
         run_stage(command)
@@ -388,7 +392,7 @@ def _stage(run_stage: Callable[[Any], None], command: Any) -> None:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-    """What a stage left, or the run itself; None where it did not.  ValueError where it cannot be read."""
+    """Content of a JSON file of a run; None if there is none, ValueError if it cannot be read."""
     from droid_jax.report.reading import Reader
 
     return Reader("all", "--again").json(path) if path.is_file() else None

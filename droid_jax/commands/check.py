@@ -1,4 +1,4 @@
-"""`check`: what recordings hold and what looks wrong with them, before a fit."""
+"""`check`: content of recordings and probable errors in them, before a fit."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from droid_jax.preflight.inspect_log import Signal
     from droid_jax.recordings.recording import Recording
 
-ADDITION = "addition.csv"  # in the folder: what to record besides
+ADDITION = "addition.csv"  # in the folder: commands of the additional motion
 COLOURS = {"certain": "bold red", "likely": "yellow", "note": "cyan"}
 
 
 @dataclass(frozen=True)
 class CheckCommand:
-    """Look at recordings before fitting them: rates, gaps, ranges, and what can hardly be right. No fit, seconds.
+    """Check recordings before a fit: rates, gaps, ranges, and probable errors. Takes seconds and fits nothing.
 
-    With --scene also units, signs, order of joints, weight, gains, delays and limits are judged. A finding is certain
-    (no fit means anything), likely (something is wrong most often) or a note. With --parameters it also says which of
-    them these recordings can tell together, and which motion would tell the rest.
+    With --scene it also checks units, signs, order of joints, weight, gains, delays and limits. A finding is certain (a
+    fit would be meaningless), likely, or a note. With --parameters it also says which of them are identifiable from
+    these recordings together, and proposes a motion for the others.
     """
 
     recording: tuple[Path, ...] = ()
     """Recordings, as `convert` writes them."""
     scene: Path | None = None
-    """MJCF that they are meant for, with its nominal values."""
+    """MJCF of the robot, with its nominal values."""
     parameters: Path | None = None
     """JSON list of the parameters that are to be fitted (docs/your-robot.md)."""
     joints: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ class CheckCommand:
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     out: Path = Path("runs/check")
-    """Folder of check.html and check.json, and of addition.csv where a motion is proposed."""
+    """Folder of check.html and check.json, and of addition.csv if a motion is proposed."""
 
 
 def run(command: CheckCommand) -> None:
@@ -57,9 +57,9 @@ def run(command: CheckCommand) -> None:
     from droid_jax.storage import refuse_special, write_own
 
     if not command.recording:
-        raise ValueError("check needs --recording, the recordings to look at (`convert` makes some of other logs)")
+        raise ValueError("check needs --recording, the recordings to check (`convert` makes recordings of other logs)")
     if command.scene is None and (command.joints or command.object_joint or command.parameters):
-        raise ValueError("--joints, --object-joint and --parameters are of a scene: give --scene too")
+        raise ValueError("--joints, --object-joint and --parameters refer to a scene: give --scene too")
     refuse_special(command.out, "a folder")
     recordings = [recording_at(path) for path in command.recording]
     needs_log(command.motion_cutoff, recordings)
@@ -76,17 +76,17 @@ def run(command: CheckCommand) -> None:
     elif command.parameters is not None:
         try:
             excited = _excitation(command, recordings)
-        except ValueError as error:  # of the replay: what was found above is said all the same
+        except ValueError as error:  # of the replay; the findings above are printed anyway
             why = str(error)
     if command.parameters is not None and why:
-        print(f"which parameters these recordings tell was not looked at: {why}")
+        print(f"identifiability was not checked: {why}")
     if excited is not None:
         _show_excitation(*excited)
     page = check_page(checked, None if command.scene is None else command.scene.stem, excited)
     files = {"check.json": _json(command, checked, excited), "check.html": page.encode()}
     if excited is not None and excited[1].chosen:
         files[ADDITION] = _csv(excited[1])
-        print(f"the motion, as commands: {command.out / ADDITION}; see that its way is free")
+        print(f"commands of the motion: {command.out / ADDITION}; make sure that its way is free")
     write_own(command.out, files)
     print(f"page: {command.out / 'check.html'}")
 
@@ -94,11 +94,11 @@ def run(command: CheckCommand) -> None:
 def _scene(
     path: Path, command: CheckCommand, recording: Recording, friction_joints: Sequence[str] = ()
 ) -> tuple[Scene, tuple[Finding, ...]]:
-    """The scene that a recording is meant for, and what has to be known of it: that plain C alone can replay it."""
+    """The scene of a recording, with a note if only plain C can replay it."""
     from droid_jax.model.scene import load_scene
     from droid_jax.preflight.findings import Finding
 
-    # A log without commands may have been measured on a robot that the scene drives with nothing.
+    # The scene of a log without commands may have no actuators.
     joints = command.joints or (() if recording.command.size else _measured(recording))
     load = partial(
         load_scene, path, joints=joints or None, object_joint=command.object_joint, friction_joints=friction_joints,
@@ -113,7 +113,7 @@ def _scene(
 
 
 def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple[Excitation, MotionProposal] | None:
-    """Which parameters the recordings tell, and what would tell the rest; None without --parameters."""
+    """Identifiability of the parameters, and the motion proposed for the others; None without --parameters."""
     if command.parameters is None or command.scene is None:
         return None
     from droid_jax.commands.options import compared
@@ -129,14 +129,14 @@ def _excitation(command: CheckCommand, recordings: Sequence[Recording]) -> tuple
 
 
 def _show_excitation(found: Excitation, proposal: MotionProposal) -> None:
-    """The table of parameters on the terminal, and the sentence below it."""
+    """Print the table of parameters and the proposed motion."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     console = Console()
-    table = Table(title=Text("What these recordings tell of the parameters, before a fit"))
-    for name in ("parameter", "unit", "of the prior's width left", "identifiable", "trades with"):
+    table = Table(title=Text("Identifiability of the parameters from these recordings, before a fit"))
+    for name in ("parameter", "unit", "posterior width, of the prior's", "identifiable", "correlated with"):
         table.add_column(name, overflow="fold")
     for parameter, verdict in zip(found.space.parameters, found.identifiability, strict=True):
         partners = ", ".join(f"{name} ({value:+.2f})" for name, value in verdict.partners)
@@ -152,7 +152,7 @@ def _show_excitation(found: Excitation, proposal: MotionProposal) -> None:
 
 
 def _csv(proposal: MotionProposal) -> bytes:
-    """The commands of a proposal: time, s, and the joints, rad or m."""
+    """A proposal's commands as CSV: time in s, and a column for each joint in rad or m."""
     time, rows = proposal.commands()
     lines = [",".join(("time", *proposal.joints))]
     lines += [",".join(f"{value:.6g}" for value in (t, *row)) for t, row in zip(time, rows, strict=True)]
@@ -160,12 +160,12 @@ def _csv(proposal: MotionProposal) -> bytes:
 
 
 def _measured(recording: Recording) -> tuple[str, ...]:
-    """Joints of a log without commands."""
+    """Measured joints of a log without commands."""
     return tuple(dict.fromkeys(j for key, c in recording.channels.items() if key != "object_angle" for j in c.columns))
 
 
 def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Finding]) -> None:
-    """The tables of one recording on the terminal."""
+    """Print the table and the findings of one recording."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -174,7 +174,7 @@ def _show(recording: Recording, tracks: Sequence[Signal], findings: Sequence[Fin
     head = f"{recording.name}: {recording.repeats} x {recording.duration:.4g} s"
     table = Table(title=Text(head))
     for name in ("signal", "column", "unit", "lowest", "highest", "measured", "rate, Hz", "longest step, s"):
-        # A name that is too long goes on below, none is cut.
+        # Long names wrap instead of being cut.
         table.add_column(name, overflow="fold", min_width=8 if name == "signal" else None)
     for track in tracks:
         for i, column in enumerate(track.columns):

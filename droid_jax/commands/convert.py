@@ -1,4 +1,4 @@
-"""`convert`: whatever was logged into a recording."""
+"""`convert`: logs of any format into a recording."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ OF_LOGS = (*SHARED, "map", "columns", "units", "episodes")
 
 @dataclass(frozen=True)
 class Convert:
-    """Read a log, check it, and write a recording that identify takes.
+    """Read a log, check it, and write a recording for the other commands.
 
     Logs are ROS bags, tables (CSV, parquet), npz and HDF5 files, .pt files of torch.save, LeRobot datasets, and CSV
-    folders.  Most do not say what their columns or efforts are, nor the servo's gains: say it here, or in a map.
+    folders.  Most state neither the meaning of their columns and torques nor the servo gains: state them here or in a
+    map.
     """
 
     source: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -36,30 +37,31 @@ class Convert:
     out: Path = Path("runs/recording.npz")
     """File (npz) or folder (CSV) to write."""
     name: str | None = None
-    """What runs and pages call the recording; default: of bags that of --out, otherwise the name that it has."""
+    """Name of the recording in runs and pages. Default: the stored name, or for bags and logs that of --out."""
     map: Path | None = None
-    """Tables, npz, HDF5, .pt, LeRobot: a TOML file that says which columns are what (docs/file-formats.md), or a layout
-    by its name: droid, robomimic, pace. Default: the map of an earlier log beside --out, or a layout that fits."""
+    """Tables, npz, HDF5, .pt, LeRobot: a column map, a TOML file (docs/file-formats.md), or a known layout by its name:
+    droid, robomimic, pace. Default: the map of an earlier log beside --out, or a layout that matches."""
     columns: tuple[str, ...] = ()
-    """The same, or changes of the map, as CHANNEL=COLUMN: time, command, position, velocity, torque, object_angle. E.g.
-    position=q{n}, which takes q1, q2, ..., or position=state[0:6]. powered=COLUMN: 0 where the motors are off."""
+    """Entries of a map, or changes of the given one, as CHANNEL=COLUMN: time, command, position, velocity, torque,
+    object_angle. E.g. position=q{n}, which takes q1, q2, ..., or position=state[0:6]. powered=COLUMN: 0 where the
+    motors are off."""
     units: tuple[str, ...] = ()
-    """The same: units of those columns as KIND=UNIT, e.g. angle=deg time=ms torque=mA length=mm force=N."""
+    """Units of those columns as KIND=UNIT, e.g. angle=deg time=ms torque=mA length=mm force=N."""
     episodes: tuple[str, ...] = ()
     """LeRobot: numbers of the episodes; HDF5: groups, e.g. data/demo_0. Each is one repeat."""
     joints: tuple[str, ...] = ()
     """Measured joints, in the order wanted. Of bags also as NAME=NAME_IN_THE_MESSAGES, e.g. joint1=panda_joint1."""
     slides: tuple[str, ...] = ()
-    """Those of --joints that slide: N, m and m/s instead of N m, rad and rad/s."""
+    """Prismatic joints among --joints: N, m and m/s instead of N m, rad and rad/s."""
     torque: Literal["motor", "link", "none"] | None = None
-    """What the torque is: motor (current, actuator force) or link (a sensor behind the gear, a Panda's tau_J). None: it
-    is not read."""
+    """Where the torque was measured: motor (current, actuator force) or link (a sensor behind the gear, a Panda's
+    tau_J). none: the torque is not read."""
     gravity: bool = False
-    """The torque contains what carries the arm's weight. A map that says so keeps it; take it out of the map where it
-    is not so."""
+    """The torque includes gravity compensation of the arm. If a map states this, the option cannot revoke it: edit the
+    map."""
     torque_constant: tuple[float, ...] = ()
-    """N m (N) at the joint that one unit of the logged torque is, for each torque or one for all: of efforts that are
-    amperes or per cent; with --units torque=mA (or force=mA) that one A is. A negative one turns the sign."""
+    """Torque at the joint, N m (N), per unit of the logged torque, for each torque or one for all, if the log has
+    amperes or per cent. With --units torque=mA (or force=mA): per A. A negative constant inverts the sign."""
     state_topic: str = "/joint_states"
     """Bags: topic of JointState, or of the state of a controller, of a Franka arm or of unitree's motors."""
     command_topic: str | None = None
@@ -70,13 +72,13 @@ class Convert:
     damping: tuple[float, ...] = ()
     """Servo damping of the commanded joints, N m s/rad (N s/m for slides); default: the scene's."""
     known: tuple[str, ...] = ()
-    """What is known in this recording alone, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or the
-    parameter that stands for it there, e.g. payload=tool."""
+    """Parameters with a known value in this recording, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or
+    the parameter that replaces it in this recording, e.g. payload=tool."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
     --joints."""
     motors: tuple[int, ...] = ()
-    """Bags: places of --joints in messages without names that hold more joints (unitree's), counted from 0."""
+    """Bags: indices of --joints in messages without names that have more joints (unitree's), counted from 0."""
     velocity_actuators: tuple[str, ...] = ()
     """Bags: <velocity> actuators in the MJCF, one per commanded joint, that take the commands' velocities."""
     effort_actuators: tuple[str, ...] = ()
@@ -84,17 +86,18 @@ class Convert:
     command_tolerance: float = 5e-3
     """How far the repeats' commands may differ, rad or m."""
     rate: float | None = None
-    """Rate of the common clock, Hz; default: of bags the usual rate of the first one's joint states, of other logs
-    their own clocks. Of a log without a column of time: the rate of its rows."""
+    """Rate of the common clock, Hz. Default: for bags the median rate of the first bag's joint states, for other logs
+    their own clocks. For a log without a column of time: the rate of its rows."""
     stamps: Literal["auto", "header", "bag"] = "auto"
-    """Bags: stamps that count: header, of the recorder (bag), or header where all messages have one (auto)."""
+    """Bags: time stamps that are used: header, those of the recorder (bag), or header if all messages have one
+    (auto)."""
     phases: tuple[str, ...] = ()
     """Parts of the motion as NAME=START:END, in s from where the log begins, e.g. approach=0:1.5 grasp=1.5:2.
-    Pages tell the gap by them; with a phase grasp, one whose grip is lost in the replay counts as failed."""
+    Pages show the discrepancy by phase. With a phase named grasp, a replay that loses the grip counts as failed."""
     allow_jitter: bool = False
     """Accept clocks of an irregular rate."""
     resample: bool = False
-    """CSV: repeats with clocks of their own are interpolated onto the first one's."""
+    """CSV folders: interpolate repeats with different clocks onto the clock of the first one."""
     start: float | None = None
     """Keep the part from here, s. A replay of commands begins at rest: cut where the robot stands still."""
     end: float | None = None
@@ -102,7 +105,7 @@ class Convert:
 
 
 def run(command: Convert) -> None:
-    """Load whatever it is, validate, cut, and save."""
+    """Load the log, validate it, cut it, and save the recording."""
     from droid_jax.recordings.formats import bags_at, check_target, load_recording, rosbag_reader, save_recording
     from droid_jax.recordings.log_files import is_log
     from droid_jax.recordings.units import with_torque_constants
@@ -121,8 +124,8 @@ def run(command: Convert) -> None:
         if others and strange:
             what = "is no ROS bag" if strange[0].exists() else "does not exist"
             raise ValueError(
-                f"{strange[0]} {what}: of several sources each is a bag or a folder of bags, or all are logs of one "
-                "kind; convert others alone"
+                f"{strange[0]} {what}: several sources must all be bags or folders of bags, or all be logs of one "
+                "kind; convert others one by one"
             )
         _needs_effect(command, "" if strange else "ROS bags", () if strange else OF_BAGS)
         if others:
@@ -148,7 +151,7 @@ def run(command: Convert) -> None:
 
 
 def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
-    """The recording in logs with a column map, and what keeps that map for the next log."""
+    """The recording in logs with a column map, and a function that stores the map for the next log."""
     import msgspec
 
     from droid_jax.recordings.column_map import check_map_target, map_beside, write_map
@@ -184,19 +187,19 @@ def _from_log(command: Convert) -> tuple[Recording, Callable[[], None]]:
     def keep() -> None:
         if command.map is not None and command.map.resolve() == beside.resolve():
             return  # the user's own
-        write_map(msgspec.structs.replace(columns, stiffness=[], damping=[]), beside)  # gains are changed between logs
+        write_map(msgspec.structs.replace(columns, stiffness=[], damping=[]), beside)  # gains differ between logs
         print(f"the next log of this kind needs no options while {beside} is there")
         if columns.stiffness:
-            print("but its own --stiffness and --damping: servo gains are of one log, and the map does not keep them")
+            print("except --stiffness and --damping: servo gains belong to one log, and the map does not store them")
         torque = columns.channel("torque")
         if command.torque_constant and torque is not None and torque.torque_constant is None:
-            print("but its --torque-constant: the map keeps those of torques in A, mA, V and % alone")
+            print("except --torque-constant: the map stores it only for torques in A, mA, V and %")
 
     return recording, keep
 
 
 def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:
-    """ "a=b" each as a mapping; ValueError for other words."""
+    """Mapping of texts "a=b"; ValueError for other texts."""
     out: dict[str, str] = {}
     for word in words:
         key, sign, value = word.partition("=")
@@ -207,7 +210,7 @@ def _pairs(words: tuple[str, ...], usage: str) -> dict[str, str]:
 
 
 def _joints(words: tuple[str, ...]) -> tuple[str, ...] | dict[str, str]:
-    """Names of joints; as a mapping where their names in the messages are given."""
+    """Names of joints; a mapping if their names in the messages are given too."""
     if not any("=" in word for word in words):
         return words
     same = tuple(word if "=" in word else f"{word}={word}" for word in words)
@@ -226,9 +229,9 @@ def _known(words: tuple[str, ...]) -> dict[str, float | str]:
 
 
 def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:
-    """ValueError for options that would change nothing; a path that does not exist is reported as such.
+    """ValueError for options without an effect on this kind of source; a missing path is reported elsewhere.
 
-    what: is read, "" a recording.  known: options that it takes.
+    what: the kind of source, "" for a recording.  known: options that it takes.
     """
     source = command.source[0]
     if command.resample and (what or source.is_file()):
@@ -246,7 +249,7 @@ def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:
 
 
 def _bag_options(command: Convert) -> dict[str, Any]:
-    """What bags do not say; ValueError names what is missing."""
+    """Options that bags need; ValueError for missing ones."""
     import numpy as np
 
     from droid_jax.recordings.recording import ServoGains, TorqueConvention, TorqueSide
@@ -282,7 +285,7 @@ def _bag_options(command: Convert) -> dict[str, Any]:
 
 
 def _phase(words: str) -> Phase:
-    """ "grasp=1.5:2" as a phase; ValueError for other words."""
+    """The phase in a text such as "grasp=1.5:2"; ValueError for other texts."""
     from droid_jax.recordings.recording import Phase
 
     name, _, span = words.partition("=")

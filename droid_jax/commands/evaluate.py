@@ -31,32 +31,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Try a trained policy: in the simulation it was trained in, and on the synthetic robot (plain C MuJoCo with hidden
-    physics, sensor noise and, where wanted, a hidden effect)."""
+    """Test a trained policy: in the simulation in which it was trained, and on the synthetic robot (plain C MuJoCo with
+    hidden physics, sensor noise and, optionally, a hidden effect)."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of `train` or of `all`. Default: runs/train where it holds a policy, else runs/all."""
     trials: int = 100
     """Trials on the synthetic robot, and episodes in simulation."""
     springs: Literal[0, 1, 2] | None = None
-    """Springs on the synthetic robot's door. Default: those of the synthetic robot that was fitted, else 1."""
+    """Springs on the synthetic robot's door. Default: as on the fitted synthetic robot, otherwise 1."""
     hide: tuple[str, ...] | None = None
-    """What the synthetic robot hides, name=amplitude; none for nothing. Default: what the fitted one hid."""
+    """Hidden effect, name=coefficient; none for no effect. Default: that of the fitted synthetic robot."""
     robot: int | None = None
-    """Seed of the synthetic robot's hidden values. Default: that of the one that was fitted, else 0."""
+    """Seed of the synthetic robot's hidden values. Default: that of the fitted synthetic robot, otherwise 0."""
     seed: int = 0
     """Seed of start poses and sensor noise."""
     film: bool = True
     """Film a good and a bad trial."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     again: bool = False
-    """Try again what was tried already."""
+    """Repeat trials that the folder already has."""
 
 
 @writes("train", lambda command: stage_folder(command.run, "train", TRAINING), make=False)
 def run(command: Evaluate) -> None:
-    """Try the policy, write transfer.json and the films, and build the page; not again where that was done."""
+    """Test the policy, write transfer.json and the films, and build the page; trials that exist are not repeated."""
     needs_brax()
     needs_trials(command.trials)
     from droid_jax import runtime
@@ -78,13 +78,13 @@ def run(command: Evaluate) -> None:
     setup_now = {**setup_of(command), "run": str(folder), "policy_sha256": file_sha256(folder / POLICY)}
     if not command.again and _done(folder, setup_now):
         print(f"{folder} holds these trials already (start over with --again)")
-        _tell(read_policy(folder))
+        _print_trials(read_policy(folder))
         report.run(report.Report(folder))
         return
     scene, gaussian, effects = source(folder, trained.setup.knob)
     env = DoorEnv(scene, _task(folder, read_json(folder / TRAINING)["task"]), effects)
     robot, truth = _robot(command, trained, env)
-    # All of them are one compiled program, which does not say how far it is.
+    # One compiled program runs all of them and reports no progress.
     with counting("episodes in simulation, a minute of compiling first", command.trials) as count:
         inside = simulated(policy, env, of_method(trained.setup.method, scene, gaussian), command.trials, command.seed)
         count(command.trials)
@@ -92,7 +92,7 @@ def run(command: Evaluate) -> None:
         outside = transfer(policy, robot, count)
     inside.check()
     outside.check()
-    with new_folder(folder / FILMS) as films:  # those of an earlier policy stay until these are there
+    with new_folder(folder / FILMS) as films:  # replaces those of an earlier policy at the end
         no_films = _film(films, policy, robot, outside) if command.film else "they were not asked for (--no-film)"
     content = {
         "simulation": inside.to_json(),
@@ -106,30 +106,30 @@ def run(command: Evaluate) -> None:
         "versions": runtime.versions(),
         "device": runtime.device(),
     }
-    write_json(folder / TRANSFER, content)  # last: its presence says that the trials are whole
-    _tell(read_policy(folder))
+    write_json(folder / TRANSFER, content)  # last: its presence means that the trials are complete
+    _print_trials(read_policy(folder))
     report.run(report.Report(folder))
 
 
 def needs_trials(trials: int) -> None:
-    """ValueError where there is nothing to try."""
+    """ValueError unless there is at least one trial."""
     if trials < 1:
         raise ValueError(f"--trials must be 1 or more, got {trials}")
 
 
 def _done(folder: Path, setup: dict[str, Any]) -> bool:
-    """Whether the folder holds the transfer.json of these very trials, whole."""
+    """Whether the folder has a complete transfer.json of these trials."""
     from droid_jax.report.policy_folder import read_policy
 
     try:
         found = read_policy(folder).transfer
-    except ValueError:  # broken: it is made again
+    except ValueError:  # damaged: the trials are repeated
         return False
     return found is not None and not changed(found.setup, setup)
 
 
 def _task(folder: Path, known: Mapping[str, Any]) -> Task:
-    """The task that a folder's policy was trained for; ValueError where this program knows another one."""
+    """The task of a folder's policy; ValueError if this version's task lacks some of its fields."""
     from droid_jax.door.task import Task
 
     strange = sorted(set(known) - {f.name for f in dataclasses.fields(Task)})
@@ -138,8 +138,8 @@ def _task(folder: Path, known: Mapping[str, Any]) -> Task:
     return Task(**known)
 
 
-def _tell(trained: Trained) -> None:
-    """Two lines of the trials, and what they do not say."""
+def _print_trials(trained: Trained) -> None:
+    """Print the success rates of the trials, and a caveat if another robot was fitted."""
     from droid_jax.report.text import lines
 
     for line in lines("evaluate.txt.jinja", trials=trained.trials, another_robot=trained.training.another_robot):
@@ -147,7 +147,7 @@ def _tell(trained: Trained) -> None:
 
 
 def _robot(command: Evaluate, trained: Training, env: DoorEnv) -> tuple[PolicyRobot, dict[str, float]]:
-    """The synthetic robot, the one that was fitted unless asked for another; and its hidden values."""
+    """The synthetic robot of the trials and its hidden values; by default the fitted one."""
     from droid_jax.door.scene import door_scene
     from droid_jax.synthetic.hidden_effects import as_applied
     from droid_jax.synthetic.policy_trials import TransferConfig, synthetic_robot
@@ -166,9 +166,9 @@ def _robot(command: Evaluate, trained: Training, env: DoorEnv) -> tuple[PolicyRo
 
 
 def _film(folder: Path, policy: Policy, robot: PolicyRobot, found: Trials) -> str | None:
-    """good.webp and bad.webp: of the trials that succeeded and of those that failed, the one of median angle.
+    """Write good.webp and bad.webp: the successful and the failed trial of median angle.
 
-    Trials that blew up are no failures.  Returns why nothing could be drawn, where nothing could.
+    Diverged trials do not count as failures.  Returns the reason if no film could be made.
     """
     import numpy as np
 

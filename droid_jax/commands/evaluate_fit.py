@@ -1,4 +1,4 @@
-"""`evaluate-fit`: a finished fit on other recordings, in physical units."""
+"""`evaluate-fit`: errors of a finished fit on other recordings, in physical units."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from droid_jax.files import EVALUATION, EVALUATION_FORMAT, EVALUATION_TRACES, EV
 
 @dataclass(frozen=True)
 class EvaluateFit:
-    """Replay recordings with a fitted model: mean absolute and RMS error of each joint and channel, before and after
-    the fit, open loop over the whole recording."""
+    """Replay recordings with a fitted model, open loop over the whole recording: mean absolute and RMS error of each
+    joint and channel, before and after the fit."""
 
     recording: tuple[Path, ...]
-    """Recordings to evaluate on (npz or CSV folder), with whatever channels were measured."""
+    """Recordings to evaluate on (npz or CSV folder); all measured channels are evaluated."""
     fit: Path = Path("runs/identify")
-    """Folder of a finished `identify` or `gap`, or of `all`, of which the extended model counts first."""
+    """Folder of a finished `identify`, `gap` or `all`. Of `all` the extended model is used, if there is one."""
     scene: Path | None = None
-    """MJCF to evaluate in, where the fitted one has moved or another variant is wanted. Default: the fitted one."""
+    """MJCF to evaluate in, if the fitted one has moved or another variant is wanted. Default: the fitted one."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own, where the fit was made with them; it is run."""
+    """Python file that registers your own effects, if the fit has some; it is executed."""
     out: Path = Path("runs/evaluation")
-    """Results folder: evaluation.json, evaluation.npz and report.html; an earlier evaluation in it is replaced."""
+    """Results folder: evaluation.json, evaluation.npz and report.html. An earlier evaluation is replaced."""
 
 
 @writes(None)

@@ -1,4 +1,4 @@
-"""`export`: a trained policy to take along to a robot."""
+"""`export`: the files of a trained policy for a robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from droid_jax.files import POLICY
 @dataclass(frozen=True)
 class Export:
     """Write a trained policy for a robot's computer: ONNX (checked against JAX), npz, and a control loop that needs
-    numpy alone (docs/policy-on-a-robot.md)."""
+    only numpy (docs/policy-on-a-robot.md)."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of `train` or of `all`. Default: runs/train where it holds a policy, else runs/all."""

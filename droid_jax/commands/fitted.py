@@ -1,4 +1,4 @@
-"""A finished fit as a model that can be replayed: of `identify`, or the extended model of `gap`."""
+"""A finished fit as a model for replays: of `identify`, or the extended model of `gap`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Fitted:
     """A fitted model.
 
     stage: "identify" or "gap".  before, after: [D] initial means and fitted values over the space.  recordings: hashes
-    of those that it was fitted to.
+    of the fitted recordings.
     """
 
     stage: str
@@ -45,9 +45,9 @@ class Fitted:
 
 
 def fitted_folder(given: Path) -> tuple[str, Path]:
-    """The stage whose model a folder holds, and where: it, or one of `all`, of which the extended model counts first.
+    """The stage and the folder of a finished fit: `given`, or one of its stages; the extended model first.
 
-    Raises ValueError where there is none.
+    Raises ValueError if there is none.
     """
     for stage, name in (("gap", GAP), ("identify", CONFIG)):
         for folder in (given, given / stage):
@@ -64,10 +64,10 @@ def load_fitted(given: Path, scene: Path | None = None) -> Fitted:
 
     Args:
         given: folder of `identify`, `gap` or `all`.
-        scene: MJCF in place of the one that was fitted, which may have moved.
+        scene: MJCF in place of the fitted one, which may have moved.
 
     Raises:
-        ValueError: no finished fit there, or its scene is not there or not the same any more.
+        ValueError: there is no finished fit, or its scene is missing or has changed.
     """
     stage, folder = fitted_folder(given)
     asked = setup(folder)
@@ -121,7 +121,7 @@ def _extended(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitted
 
 
 def _fitted_by_search(folder: Path, hashes: Sequence[str]) -> tuple[str, ...]:
-    """Those of a search's recordings that its models were fitted to: the third of three motions is test data."""
+    """Hashes of a search's fitted recordings: the third of three motions is test data."""
     from droid_jax.recordings.split import Split
 
     by = read_json(folder / GAP).get("split", {}).get("by")
@@ -129,7 +129,7 @@ def _fitted_by_search(folder: Path, hashes: Sequence[str]) -> tuple[str, ...]:
 
 
 def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]) -> Scene:
-    """The scene that a setup.json asked for, or `given` in its place; rubbed: joints whose friction loss was fitted."""
+    """The scene of a setup.json, or `given` in its place; rubbed: joints whose friction loss was fitted."""
     from droid_jax.commands.options import TIMESTEP
     from droid_jax.door.scene import door_scene
     from droid_jax.model.scene import load_scene
@@ -141,26 +141,26 @@ def _scene_of(asked: dict[str, Any], given: Path | None, rubbed: tuple[str, ...]
         return door_scene(gains="paper" if preset == "paper" else "impedance", timestep=TIMESTEP[preset])
     path = Path(asked["scene"]) if given is None else given
     if not path.is_file():
-        raise ValueError(f"the fitted scene {path} is not there: say where it is now (--scene)")
+        raise ValueError(f"the fitted scene {path} does not exist: give its new path (--scene)")
     return load_scene(
         path,
         joints=asked.get("joints") or None,
         object_joint=asked.get("object_joint"),
         friction_joints=rubbed,
-        hold=asked.get("joint_friction") == "held",  # runs from before there was a choice had the scene's own
+        hold=asked.get("joint_friction") == "held",  # earlier versions had no such option
         engine="mujoco" if asked.get("engine") == "mujoco" else "mjx",
         mj_step=asked.get("mj_step", False),
     )
 
 
 def _check_same(folder: Path, asked: dict[str, Any], scene: Scene, given: Path | None) -> None:
-    """ValueError for a scene that was changed after the fit; of one that was given on purpose that is said."""
+    """ValueError for a scene that was changed after the fit; a warning if it was given explicitly."""
     if asked.get("scene_sha256") in (None, scene.sha256):
         return
     before, now = asked.get("versions", {}).get("mujoco"), importlib.metadata.version("mujoco")
-    if before not in (None, now):  # whose compiled models have other fields
+    if before not in (None, now):  # compiled models of other versions have other hashes
         warnings.warn(
-            f"{folder} was fitted with MuJoCo {before}, not {now}: its scene is taken for the same", stacklevel=2
+            f"{folder} was fitted with MuJoCo {before}, not {now}: its scene is assumed to be unchanged", stacklevel=2
         )
         return
     if given is None:
@@ -172,13 +172,13 @@ def _check_same(folder: Path, asked: dict[str, Any], scene: Scene, given: Path |
 
 
 def _rubbed(parameters: Iterable[Parameter]) -> tuple[str, ...]:
-    """Joints whose friction loss parameters write: the scene was compiled with a row for each."""
+    """Joints whose friction loss is a parameter; the scene was compiled with a constraint for each."""
     writes = (w for p in parameters for w in p.writes)
     return tuple(dict.fromkeys(w.element for w in writes if w.field == "dof_frictionloss" and w.element))
 
 
 def _command(kind: type[Options], asked: dict[str, Any]) -> Options:
-    """A command from its options in a setup.json; those that came later have their defaults."""
+    """A command from its options in a setup.json; options that are missing there have their defaults."""
 
     def option(name: str, value: Any) -> Any:
         if isinstance(value, list):

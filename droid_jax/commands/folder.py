@@ -1,4 +1,4 @@
-"""A run's folder before and after the run: whose it is, whether the run is whole, what it can go on from."""
+"""A run's folder before and after the run: its options, whether the run is complete, and what a new run removes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
 
-RUNS = Path("runs")  # where results go unless --out says otherwise
+RUNS = Path("runs")  # default place of results
 BEGUN = set[Path]()  # folders of the runs that this process began
-HASHED = ("user_effects", "extended")  # options whose file is in no other hash of a setup
-LATER = ("budget",)  # options of which nothing that an unfinished run has kept depends
-CODE = "versions"  # in setup.json: of the code that began the run, which others may go on with
+HASHED = ("user_effects", "extended")  # options whose file has its own hash in a setup
+LATER = ("budget",)  # options that may change when an unfinished run continues
+CODE = "versions"  # in setup.json: versions of the code that began the run; other versions may continue it
 PATHS = (
     "recording",
     "judge_on",
@@ -34,16 +34,16 @@ PATHS = (
     "fit",
     "run",
     *HASHED,
-)  # beside each a setup holds what the file says
-INPUTS = ("start", "synthetic_robot")  # in a setup: of what a run was given by another, as are all that end in _sha256
+)  # options with paths; a setup also has the content's hash
+INPUTS = ("start", "synthetic_robot")  # entries of a setup from other runs, like all that end in _sha256
 
 
 def setup_of(command: Any) -> dict[str, Any]:
-    """What decides a run's results, as plain data: a finished run with the same is not run again."""
+    """The options that determine a run's results, as plain data; a finished run with equal ones is not repeated."""
     fields = dataclasses.asdict(command)
     for name in ("out", "again", "force", "tensorboard"):
         fields.pop(name, None)
-    for name in HASHED:  # a changed file makes another run
+    for name in HASHED:  # a changed file means another run
         if path := fields.get(name):
             fields[f"{name}_sha256"] = file_sha256(path)
     return {k: [str(v) for v in value] if isinstance(value, tuple) else _plain(value) for k, value in fields.items()}
@@ -54,16 +54,16 @@ def _plain(value: Any) -> Any:
 
 
 def stage_folder(given: Path | None, stage: str, file: str) -> Path:
-    """The folder of a stage that a command is to read.
+    """The folder of a stage that a command reads.
 
-    given: it, or one of `all` that holds it; None: RUNS/STAGE, or where that lacks `file`, the one below RUNS/all.
+    given: that folder, or one of `all` that has it; None: RUNS/STAGE, or below RUNS/all if the former lacks `file`.
     """
     tried = (RUNS / stage, RUNS / "all" / stage) if given is None else (given, given / stage)
     return next((folder for folder in tried if (folder / file).is_file()), tried[0])
 
 
 def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) -> dict[str, Any]:
-    """Hashes of what a run's files say, for its setup: it does not go on with changed ones."""
+    """Hashes of scene, parameters and recordings for a run's setup; a run does not continue with changed ones."""
     from droid_jax.identify.gaussian import space_to_json
 
     return {
@@ -74,14 +74,14 @@ def fingerprints(scene: Scene, space: Space, recordings: Iterable[Recording]) ->
 
 
 def changed(before: Mapping[str, Any], setup: Mapping[str, Any]) -> list[str]:
-    """What differs between two setups; where a file lies does not count, what it says does; nor does the code."""
+    """Names of the entries that differ between two setups; paths of files and versions of the code are ignored."""
     return sorted(k for k in {*before, *setup} - {CODE, *PATHS} if before.get(k) != setup.get(k))
 
 
 class OtherRun(ValueError):
-    """The folder holds a run with other settings or inputs; `what` says which.
+    """The folder has a run with other settings or inputs; `what` is a sentence with their names.
 
-    inputs: whether only what it was given differs, and nothing that was asked for.
+    inputs: whether only inputs differ, and no option.
     """
 
     def __init__(self, out: Path, changed: Iterable[str]) -> None:
@@ -92,11 +92,11 @@ class OtherRun(ValueError):
 
 
 def finished(out: Path, setup: dict[str, Any], again: bool, last: str = CONFIG) -> bool:
-    """True where the folder holds this very run, whole: with `last`, the file that is written last.
+    """Whether the folder has this run, complete: with `last`, the file that is written last.
 
-    Says so where a run goes on with other code than it was begun with.
+    Prints a message, also if a run continues with other code than it was begun with.
 
-    Raises OtherRun for a folder with another run in it, ValueError where its setup.json is damaged.
+    Raises OtherRun for a folder with another run, ValueError if its setup.json is damaged.
     """
     path = out / SETUP
     if again or not path.is_file():
@@ -121,7 +121,7 @@ def finished(out: Path, setup: dict[str, Any], again: bool, last: str = CONFIG) 
 
 
 def _with_other_code(before: Mapping[str, Any]) -> str:
-    """What of the code that began a run has changed since, in words; empty where nothing has, or nobody knows."""
+    """Text with the versions that changed since a run was begun; empty if none did, or if they are unknown."""
     from droid_jax import runtime
 
     if not (old := before.get(CODE)):
@@ -136,15 +136,15 @@ def _with_other_code(before: Mapping[str, Any]) -> str:
 
 
 def refuse_own_source(out: Path, fit: Path | None) -> None:
-    """ValueError where a run would start over in the folder that it starts from."""
+    """ValueError if a run would overwrite the folder of the fit from which it starts."""
     if fit is not None and out.resolve() == fit.resolve():
         raise ValueError(f"--out {out} holds the fit that this run starts from: choose another --out")
 
 
 def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool = False) -> None:
-    """Only now, with all input read, forget an earlier run's results, and say what runs here.
+    """Remove an earlier run's results and write setup.json; call it when all inputs are valid.
 
-    again: its checkpoints too.  keep: nothing; the results are this run's own, and it adds to them.
+    again: remove checkpoints too.  keep: remove nothing, since the results are of this run and it adds to them.
     """
     from droid_jax import runtime
     from droid_jax.storage import write_json
@@ -152,21 +152,21 @@ def begin(out: Path, setup: dict[str, Any], again: bool, stage: str, keep: bool 
     if not keep:
         for each in LAST_FILES if again and _of_another_stage(out, stage) else (stage,):
             forget(out, each, results_alone=not again)
-        for name in (EVALUATION, EVALUATION_TRACES):  # of the fit that goes
+        for name in (EVALUATION, EVALUATION_TRACES):  # of the removed fit
             (out / name).unlink(missing_ok=True)
     write_json(out / SETUP, {**setup, CODE: runtime.versions()})
     BEGUN.add(out)
 
 
 def _of_another_stage(out: Path, stage: str) -> bool:
-    """Whether another command's run is in a folder, or one of which nobody knows."""
+    """Whether a folder has a run of another command, or one without a readable setup.json."""
     with contextlib.suppress(OSError, ValueError):
         return typed(read_json(out / SETUP), Setup, SETUP).get("command", "identify") != stage  # which names none
     return any((out / LAST_FILES[other]).exists() for other in LAST_FILES if other != stage)
 
 
 def forget(out: Path, stage: str, results_alone: bool = False) -> None:
-    """Remove what a run of this stage left; its checkpoints too, from which it would go on, unless told otherwise."""
+    """Remove the results of a stage's run, and its checkpoints unless `results_alone`."""
     begun = () if results_alone else ("checkpoints", "tensorboard", SETUP)
     for name in (LAST_FILES[stage], *RESULTS[stage], *begun):
         if (path := out / name).is_dir():
@@ -176,9 +176,9 @@ def forget(out: Path, stage: str, results_alone: bool = False) -> None:
 
 
 def kept_recordings(paths: Mapping[str, Path], again: bool, record: Callable[[str], Recording]) -> dict[str, Recording]:
-    """What the synthetic robot recorded earlier into this run's folder, by name; recorded now where it did not.
+    """Recordings of the synthetic robot in this run's folder, by name; missing ones are recorded now.
 
-    paths: by name.  record: of a recording's name.
+    paths: name -> file.  record: name -> recording.
     """
     from droid_jax.recordings.formats import load_recording, save_recording
     from droid_jax.report.progress import counting

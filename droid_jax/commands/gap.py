@@ -1,4 +1,4 @@
-"""`gap`: which physical effect does the model lack?"""
+"""`gap`: searches for the physical effect that the model lacks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from droid_jax.commands.options import (
     TIMESTEP,
     Channel,
     JointFriction,
+    TestRecordings,
     compared,
     load_effects,
     needs_log,
@@ -47,34 +48,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GapCommand:
-    """Find the physical effect that the model lacks: fit, ask a library of effects, validate on what was not fitted.
+    """Find the physical effect that the model lacks: fit, test a library of effects, validate on other recordings.
 
     Without --recording a synthetic robot with a hidden effect is recorded first.
     """
 
     recording: tuple[Path, ...] = ()
     """TRAIN VALIDATION [TEST]: two or three motions of the same robot and object, eight repeats or more of each.
-    The fit sees the first, effects are selected on the second, the third is opened once they are.
+    Parameters are fitted to the first, effects are selected on the second, and the third is evaluated at the end.
 
-    ONE: one motion, sixteen repeats or more; the second half of them confirms.
+    ONE: one motion, sixteen repeats or more; the second half of them is validation data.
 
-    LOG [TEST]: without repeats and commands; blocks of time train and validate in turns, the last third or the second
-    log is test data. Of one motion less can be concluded, and the report says what.
+    LOG [TEST]: without repeats and commands; blocks of time are training and validation data in turns, the last third
+    or the second log is test data. One motion supports weaker conclusions; the report states them.
 
-    LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; stretches of all of them train and
-    validate in turns, and the last third of each is test data, or --judge-on."""
-    judge_on: tuple[Path, ...] = ()
-    """Commanded logs that are test data, beside others with few repeats."""
+    LOG [LOG ...]: commanded, positions measured, with fewer repeats than above; blocks of time of all logs are training
+    and validation data in turns; test data are the last third of each, or --test-recording."""
+    judge_on: TestRecordings = ()
+    """Test data: commanded logs to which no model is fitted, beside others with few repeats. (Earlier name:
+    --judge-on.)"""
     replay: Literal["auto", "whole", "windows"] = "auto"
-    """Commanded logs with few repeats. windows: replayed from measured states, each half a second long. whole: from
-    their beginnings. auto: whole where a servo holds every joint; of more than two minutes, longer windows."""
+    """How commanded logs with few repeats are replayed. whole: from their beginnings. windows: in windows of half a
+    second, each from its measured state. auto: whole if a servo holds every joint (more than two minutes in windows of
+    3 s), otherwise windows."""
     fit: Path | None = None
-    """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins there instead of with a
+    """Folder of a finished `identify` (or `all`) of this robot and object: the base fit begins at its result, without a
     search."""
     compare: tuple[Channel, ...] = ()
     """Measured channels to compare; several are weighted by their noise. Default: as in identify."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
-    """Of the base fit, as in identify."""
+    """Preset of the base fit, as in identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
@@ -82,10 +85,11 @@ class GapCommand:
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
-    """Joint of the thing that is moved, in your own scene; without it no effect of a door is tested."""
+    """Joint of the object that is moved, in your own scene; without it no effect of a door is tested."""
     joint_friction: JointFriction = "held"
-    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
-    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
+    """Dry friction of your own scene's joints. held: a stiffer constraint, with which friction holds a load still,
+    unless the MJCF sets solimpfriction or solreffriction itself. scene: the MJCF's constraint, whose default lets
+    joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     effects: tuple[str, ...] = ()
@@ -93,32 +97,32 @@ class GapCommand:
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
     effect_scale: float = 1.0
-    """Forces and torques of the library's effects, relative to an arm of a Panda's size: priors, bounds and minimum
-    effect sizes are taken times this. An axis that is driven with a kilonewton: 30."""
+    """Factor on forces and torques of the library's effects (priors, bounds, minimum effect sizes), which are those of
+    an arm of a Panda's size. For an axis with forces of a kilonewton: 30."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     budget: float | None = None
     """Minutes after which no further candidate is tried; the report says what was left out."""
     hide: tuple[str, ...] | None = None
-    """What the synthetic robot hides, name=amplitude or name[joint]=amplitude; none for nothing.
-    Default: magnetic_catch=1.5 (N m)."""
+    """Hidden effect of the synthetic robot, name=coefficient or name[joint]=coefficient; none for no effect. Default:
+    magnetic_catch=1.5 (N m)."""
     springs: Literal[0, 1, 2] | None = None
     """Springs on the synthetic robot's door. Default: 1."""
     seed: int = 0
     """Seed of the search, of the synthetic robot and of the resamples."""
     force: bool = False
-    """Search a recording too of which no fit can mean anything (`check`: certain); the report says so."""
+    """Also search a recording with a certain finding of `check`, whose fit would be meaningless; the report says so."""
     tensorboard: bool = False
     """Write scalars of the base fit for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/gap")
-    """Results folder. A run that was interrupted goes on from where it was."""
+    """Results folder. An interrupted run continues."""
     again: bool = False
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
 @writes("gap")
 def run(command: GapCommand) -> None:
-    """Record or load, fit, search, write the run's folder and its page."""
+    """Record or load, fit, search, and write the run's folder and its page."""
     from droid_jax import runtime
     from droid_jax.report.progress import FOLDER, needs_writer, stages
 
@@ -153,7 +157,7 @@ def run(command: GapCommand) -> None:
     if finished(out, setup, command.again, GAP):
         _done(out)
         return
-    known = not command.again and to_be_amended(out)  # its verdict is there and stays there
+    known = not command.again and to_be_amended(out)  # the verdict exists and stays
     if not command.force:
         refuse_certain(scene, given)
     split, roles = assigned_roles(scene, fitted, judges) if given else (Split.RECORDINGS, {})
@@ -163,13 +167,13 @@ def run(command: GapCommand) -> None:
     if not given:
         assert command.springs is not None  # settled
         roles = record_synthetic(scene, hidden, out, command.springs, command.seed, command.again)
-    then = "; then first fits, which tell the noise" if split is Split.WINDOWS else ""
+    then = "; then first fits, which estimate the noise" if split is Split.WINDOWS else ""
     print(f"compiling the replay{then} ...", flush=True)
     began = time.monotonic()
     with stages(("first_fits",) if then else ()) as show:
         case = case_of(split, scene, base, effects, roles, config, start, lambda now: show("first_fits", now))
     preparation = time.monotonic() - began
-    begin(out, setup, command.again, "gap", keep=known)  # and only now, with all of it found good
+    begin(out, setup, command.again, "gap", keep=known)  # only now that all inputs are valid
     board = out / FOLDER if command.tensorboard else None
     synthetic_robot = all(is_synthetic(r) for r in roles.values())
     robot = known_robot(command.recording or kept_at(out)) if synthetic_robot else {}
@@ -188,13 +192,13 @@ def run(command: GapCommand) -> None:
     written = list[str]()
 
     def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
-        """First the verdict, then each amendment to it: a stop or an error between them loses neither."""
+        """Write the verdict, and again after each amendment, so that a stop between them loses nothing."""
         write = write_amended if written else write_gap
         if split is Split.WINDOWS:
             values = now.verdict.base.values, now.final.model.values
             try:
                 description["open_loop"] = open_loop_errors(case, roles, *values)
-            except ValueError as error:  # the verdict does not rest on it
+            except ValueError as error:  # the verdict does not depend on it
                 warnings.warn(f"whole motions are not replayed open loop: {error}", stacklevel=2)
         write(
             out,
@@ -210,14 +214,14 @@ def run(command: GapCommand) -> None:
         searched(split, case, roles, out / "checkpoints", start, board, keep)
     except KeyboardInterrupt:
         if written:
-            print(f"the verdict is in {out / GAP}: {written[0]} What is to be added to it is made by the same command")
+            print(f"the verdict is in {out / GAP}: {written[0]} The same command makes the amendments that are missing")
         raise
     shutil.rmtree(out / "checkpoints" / "replays", ignore_errors=True)
     _done(out)
 
 
 def gap_model(command: GapCommand) -> tuple[Scene, Space]:
-    """The scene and all that is fitted without any effect, nuisances among it."""
+    """The scene and the base parameters, including nuisances."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
 
@@ -233,15 +237,15 @@ class _Value(TypedDict):
 
 
 class _Fit(TypedDict):
-    """What a search reads of a fit.json."""
+    """The entries of fit.json that a search reads."""
 
     parameters: list[_Value]
 
 
 def values_of(folder: Path, base: Space) -> np.ndarray:
-    """[F] values of the base parameters in a folder of `identify`; its nuisances where it fitted the same.
+    """Values [F] of the base parameters in a folder of `identify`; nuisances that were not fitted keep their means.
 
-    Raises ValueError where there is no whole fit, or one that lacks a parameter of this model.
+    Raises ValueError if the folder has no complete fit, or the fit lacks a parameter of this model.
     """
     needs_whole(folder)
     try:
@@ -258,10 +262,10 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
 def chosen_effects(
     command: GapCommand, scene: Scene, recordings: list[Recording], channels: Sequence[str] = ()
 ) -> tuple[Effect, ...]:
-    """The library's effects for this scene, --effects and --without applied.
+    """The library's effects for this scene, filtered by --effects and --without.
 
-    channels: that are compared, where it is not the recordings that tell.
-    Raises ValueError for unknown names, for effects that this scene cannot have, and where none is left.
+    channels: compared channels; empty: those of the recordings or of --compare.
+    Raises ValueError for unknown names, for effects that this scene cannot have, and if no effect remains.
     """
     from droid_jax.discrepancy.candidates import observable_effects
     from droid_jax.discrepancy.case import comparing
@@ -276,21 +280,21 @@ def chosen_effects(
     asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]
-    left = tuple(e for e in here if e.name in asked and e.name not in command.without)
-    nowhere = [e.name for e in left if not e.locations]
+    chosen = tuple(e for e in here if e.name in asked and e.name not in command.without)
+    nowhere = [e.name for e in chosen if not e.locations]
     if nowhere:
-        what = f"effects {', '.join(nowhere)} state no locations (Effect.locations), where they could be tested"
+        what = f"effects {', '.join(nowhere)} state no locations (Effect.locations), so they cannot be tested"
         if {*nowhere} & {*command.effects}:
             raise ValueError(what)
         warnings.warn(f"{what}: they are left out", stacklevel=2)
-    if impossible or not any(e.locations for e in left):
+    if impossible or not any(e.locations for e in chosen):
         what = f"cannot have {', '.join(impossible)}" if impossible else "is left without any effect"
         raise ValueError(f"scene {scene.name!r} {what} here; it can have: {', '.join(sorted(names))}")
-    return left
+    return chosen
 
 
 def gap_config(command: GapCommand) -> DiscrepancyConfig:
-    """The preset with the command's own numbers."""
+    """The preset's configuration with the numbers given by options."""
     from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig
     from droid_jax.identify.multistart import RefineConfig
 
@@ -309,15 +313,15 @@ def gap_config(command: GapCommand) -> DiscrepancyConfig:
 
 
 def given_to(command: GapCommand) -> list[Recording]:
-    """The recordings, those of --judge-on last; none where the synthetic robot shall record."""
+    """The given recordings, those of --test-recording last; empty if the synthetic robot is to be recorded."""
     needs_recording(command)
     if command.judge_on and not command.recording:
-        raise ValueError("--judge-on needs --recording: the synthetic robot records its own test data")
+        raise ValueError("--test-recording needs --recording: the synthetic robot records its own test data")
     return [recording_at(path) for path in (*command.recording, *command.judge_on)]
 
 
 def _done(out: Path) -> None:
-    """Build the page, and say in a few lines what was found."""
+    """Build the page and print a summary."""
     from droid_jax.report.gap_folder import largest_shifts, read_gap
     from droid_jax.report.page import write_report
     from droid_jax.report.text import lines

@@ -1,4 +1,4 @@
-"""The search behind `gap` as its command makes it: shown while it runs, timed, going on after a stop."""
+"""The search of the command `gap`: with progress, timing, and continuation after a stop."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from droid_jax.recordings.recording import Recording
     from droid_jax.recordings.split import Split
 
+# Stages that are shown and timed; docs/gap.md explains them.
 BARS = (
     "search",
     "refine",
@@ -38,14 +39,14 @@ IN_WINDOWS = (
     "one_step_fit",
     "refit",
     "verdict",
-)  # of commanded logs: several starts in place of a search
+)  # commanded logs: several starts in place of a search
 IN_BLOCKS = (
     "refine",
     "score_test",
     "one_step_fit",
     "refit",
     "verdict",
-)  # of a log: no search, and no time step to refine
+)  # a log without commands: no search, and no time step
 
 
 def searched(
@@ -57,11 +58,19 @@ def searched(
     board: Path | None = None,
     keep: Callable[[Case, Amended, Mapping[str, float]], None] = lambda case, now, seconds: None,
 ) -> tuple[Case, Verdict, FinalModel, dict[str, float]]:
-    """The case, its verdict and the model to hand on, going on from `checkpoints`; and each stage's seconds.
+    """Run the search, continuing from `checkpoints`.
 
-    start: [F] values of the base parameters from which their fit begins, instead of a search.
-    board: folder for scalars of the base fit, and of the others that report iterations.
-    keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
+    Args:
+        split: how the recordings are divided.
+        case: the recordings, base parameters and effects.
+        roles: recording by role.
+        checkpoints: folder of replays and times of a stopped run.
+        start: [F] values of the base parameters at which their fit begins, instead of a search.
+        board: folder for TensorBoard scalars of the base fit and other iterative stages.
+        keep: called with the verdict and the seconds so far, and again after each amendment.
+
+    Returns:
+        The case, its verdict, the final model, and the seconds of each stage.
     """
     from droid_jax.discrepancy.fitting import with_finer_step
     from droid_jax.discrepancy.missing import amended, search
@@ -85,7 +94,7 @@ def searched(
 
 
 def _stages(split: Split, started: bool) -> tuple[str, ...]:
-    """What is shown and timed."""
+    """Names of the stages that are shown and timed."""
     from droid_jax.recordings.split import Split
 
     known = {Split.BLOCKS: IN_BLOCKS, Split.WINDOWS: IN_WINDOWS}
@@ -93,15 +102,15 @@ def _stages(split: Split, started: bool) -> tuple[str, ...]:
 
 
 class Clock:
-    """Hands progress on, and counts the seconds of each stage; those of an earlier part of this run are in `kept`."""
+    """Forwards progress and measures the seconds of each stage; `kept` is the file with those of a stopped run."""
 
-    def __init__(self, stages: Sequence[str], tell: Sequence[Callable[[str, Any], None]], kept: Path) -> None:
-        self.stages, self.tell, self.kept = stages, tell, kept
+    def __init__(self, stages: Sequence[str], reports: Sequence[Callable[[str, Any], None]], kept: Path) -> None:
+        self.stages, self.reports, self.kept = stages, reports, kept
         self.seconds: dict[str, float] = _seconds(kept)
         self._stage, self._since = stages[0], time.monotonic()
 
     def stop(self) -> None:
-        """Count the seconds of the stage that is on."""
+        """Add the seconds of the current stage."""
         now = time.monotonic()
         self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
         self._since = now
@@ -112,12 +121,12 @@ class Clock:
             write_json(self.kept, self.seconds)
         self._stage = stage
         if stage in self.stages:
-            for tell in self.tell:
-                tell(stage, value)
+            for report in self.reports:
+                report(stage, value)
 
 
 def _seconds(kept: Path) -> dict[str, float]:
-    """What was counted before; nothing where that cannot be read, it decides nothing."""
+    """Seconds of a stopped run; empty if the file cannot be read, since no result depends on it."""
     try:
         before = typed(read_json(kept), dict[str, float], str(kept))
         return {stage: before[stage] for stage in BARS if stage in before}

@@ -1,4 +1,4 @@
-"""`identify`: recordings in, a Gaussian over the parameters out."""
+"""`identify`: fits a Gaussian over the parameters to recordings."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from droid_jax.commands.options import (
     Channel,
     JointFriction,
     Preset,
+    TestRecordings,
     compared,
     load_effects,
     needs_log,
@@ -43,25 +44,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Identify:
-    """Fit the physics to what was recorded (torques, positions): recordings in, a Gaussian over the parameters out.
+    """Fit physical parameters to recorded torques or positions; the result is a Gaussian over the parameters.
 
     Without --recording a synthetic robot (a simulation with hidden physics) is recorded first.
     """
 
     preset: Preset = "quick"
-    """quick: a laptop, minutes.  standard: 100 generations, 2 ms steps.  paper: the paper's search
-    (Table I's prior and joint damping, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
+    """quick: minutes on a laptop.  standard: 100 generations, 2 ms steps.  paper: the paper's search (Table I's prior
+    and joint damping, 30 samples, 5 parents, no refinement).  gpu: 1024 samples."""
     recording: tuple[Path, ...] = ()
     """Recordings to fit (npz or CSV folder; ROS bags through convert); several of the same robot and object are
     fitted together."""
-    judge_on: tuple[Path, ...] = ()
-    """Whole recordings to judge the fit on, which it does not see; all of --recording is then fitted. Default: the
-    last repeats judge, or the last part of a log without commands."""
+    judge_on: TestRecordings = ()
+    """Test data: whole recordings on which the fit is evaluated and to which it is not fitted. All repeats of
+    --recording are then fitted. Default: the last repeats are held out, or the last part of a log without commands.
+    (Earlier name: --judge-on.)"""
     compare: tuple[Channel, ...] = ()
-    """Measured channels to fit; several are weighted by their noise. Default: torque, or where no torque was measured
-    position (without it velocity) and the object's angle."""
+    """Measured channels to fit; several are weighted by their noise. Default: torque; without measured torques position
+    (or, without it, velocity) and the object's angle."""
     demonstrations: tuple[str, ...] | None = None
-    """What the synthetic robot repeats when no recording is given (A, B or C). Default: A C, in the paper preset A."""
+    """Demonstrations that the synthetic robot repeats if no recording is given (A, B or C). Default: A C; A with the
+    preset paper."""
     springs: Literal[0, 1, 2] | None = None
     """Springs on the synthetic robot's door (its values are the fitted columns of Table I). Default: 1."""
     scene: Path | None = None
@@ -71,52 +74,53 @@ class Identify:
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
-    """Joint of the thing that is moved, in your own scene."""
+    """Joint of the object that is moved, in your own scene."""
     joint_friction: JointFriction = "held"
-    """Dry friction of your own scene's joints. held: it holds a load still, unless the MJCF sets solimpfriction or
-    solreffriction itself. scene: as the MJCF has it, whose default lets joints creep."""
+    """Dry friction of your own scene's joints. held: a stiffer constraint, with which friction holds a load still,
+    unless the MJCF sets solimpfriction or solreffriction itself. scene: the MJCF's constraint, whose default lets
+    joints creep."""
     extended: Path | None = None
-    """extended.json of a gap search: the effects that it named are in the model and fitted too."""
+    """extended.json of a gap search: its effects are added to the model, and fitted too."""
     effects: tuple[str, ...] = ()
-    """Effects of the library (docs/discrepancy-search.md) that are in the model and fitted too, such as
+    """Effects of the library (docs/discrepancy-search.md) that are added to the model and fitted too, for example
     load_friction."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """mjx: compiled, all devices.  mujoco: plain C, all cores; of commanded logs for motor-side torques, without
-    gravity where the scene compensates it.  auto: plain C for commanded recordings of one repeat, where C can
-    replay them (beside a GPU in small batches alone); else MJX."""
+    """mjx: compiled, on all devices.  mujoco: plain C, on all cores; commanded logs need motor-side torques, without
+    gravity if the scene compensates it.  auto: plain C for commanded recordings of one repeat that C can replay (with a
+    GPU only for small batches), otherwise MJX."""
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
-    """Generations at most; default: the preset's."""
+    """Largest number of generations; default: the preset's."""
     restarts: int | None = None
     """Independent searches in one batch; default: the preset's."""
     nuisances: bool = True
-    """Fit and marginalise pose, link masses, servo gains, timing and offsets too (never in the paper preset).
-    In your own scene: those of your parameters that say "nuisance": true."""
+    """Fit and marginalise nuisances: pose, link masses, servo gains, timing and offsets (never with the preset paper).
+    In your own scene: your parameters with "nuisance": true."""
     whitened: bool = False
-    """The search counts torques in units of their noise instead of N m (the refinement always does)."""
+    """The search weights torques by their noise instead of comparing them in N m (the refinement always does)."""
     mj_step: bool = False
-    """The recordings are a MuJoCo program's own, of this scene and time step: replay them by mj_step's steps of first
-    order, row by row."""
+    """The recordings come from a MuJoCo program with this scene and time step: replay them with the first-order steps
+    of mj_step, one per row."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
     seed: int = 0
     """Seed of the search, of the synthetic robot and of the samples."""
     force: bool = False
-    """Fit a recording too of which no fit can mean anything (`check`: certain); the report says so."""
+    """Also fit a recording with a certain finding of `check`, whose fit would be meaningless; the report says so."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/identify")
-    """Results folder. A run that was interrupted goes on from where it was."""
+    """Results folder. An interrupted run continues."""
     again: bool = False
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
 @writes("identify")
 def run(command: Identify) -> None:
-    """Record or load, fit, write the run's folder and its page."""
+    """Record or load, fit, and write the run's folder and its page."""
     from droid_jax import runtime
     from droid_jax.report.progress import needs_writer
 
@@ -143,7 +147,7 @@ def run(command: Identify) -> None:
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if finished(out, setup, command.again):
-        draw_replay(out, scene)  # where OpenGL was missing, or drawing was stopped
+        draw_replay(out, scene)  # if OpenGL was missing before, or drawing was stopped
         report.run(report.Report(out))
         return
     config = identify_config(command)
@@ -155,9 +159,9 @@ def run(command: Identify) -> None:
     problem = prepare(scene, space, recordings, nuisances=nuisances, config=config, effects=effects, judge_on=judges)
     engine = {"mjx": "MJX", "mujoco": "plain C MuJoCo"}[problem.engine.engine]
     print(f"engine: {engine} ({problem.engine.why})", flush=True)
-    # The Gaussian's own, whatever becomes of the search that made it; it may lie in this very folder.
+    # Read before the folder is cleared: the file may lie in it.
     extended = None if command.extended is None else command.extended.read_bytes()
-    begin(out, setup, command.again, "identify")  # and only now, with all of it found good
+    begin(out, setup, command.again, "identify")  # only now that all inputs are valid
     if extended is not None:
         write_bytes(out / EXTENDED, extended)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -194,7 +198,7 @@ def run(command: Identify) -> None:
 def _description(
     command: Identify, found: Identified, recordings: Sequence[Recording], judges: Sequence[Recording]
 ) -> dict[str, Any]:
-    """What config.json says of a fit, its setup apart."""
+    """Content of config.json about a fit, without its setup."""
     from droid_jax import runtime
     from droid_jax.synthetic.robot import is_synthetic
 
@@ -213,13 +217,13 @@ def _description(
 
 
 def _entry(recording: Recording, heldout: Sequence[int] = ()) -> dict[str, Any]:
-    """What config.json says of a recording."""
+    """Entry of config.json for a recording."""
     named = {"name": recording.name, "sha256": recording.sha256, "repeats": recording.repeats}
     return {**named, "heldout": list(heldout), "duration": recording.duration}
 
 
 def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
-    """The scene, what is fitted, and the nuisances beside it."""
+    """The scene, the parameters of interest, and the nuisances (None for none)."""
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
 
@@ -241,7 +245,7 @@ def identify_model(command: Identify) -> tuple[Scene, Space, Space | None]:
 
 
 def identify_config(command: Identify) -> IdentifyConfig:
-    """The preset with the command's own numbers."""
+    """The preset's configuration with the numbers given by options."""
     from droid_jax.identify.pipeline import IdentifyConfig
 
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
@@ -258,7 +262,7 @@ def identify_config(command: Identify) -> IdentifyConfig:
 
 
 def with_effects(command: Identify, scene: Scene, space: Space) -> tuple[Scene, Space, tuple[Effect, ...]]:
-    """Scene and space with the effects of --extended and --effects in them, and these."""
+    """Scene and space with the effects of --extended or --effects, and these effects."""
     if command.extended is not None:
         from droid_jax.identify.extended_model import load_extended
 
@@ -272,7 +276,7 @@ def with_effects(command: Identify, scene: Scene, space: Space) -> tuple[Scene, 
 
 
 def effects_in(command: Identify, scene: Scene) -> tuple[Scene, tuple[Effect, ...]]:
-    """The scene as the effects of --extended or --effects need it, and these."""
+    """The scene as the effects of --extended or --effects need it, and these effects."""
     needs_one(command)
     if command.extended is not None:
         from droid_jax.identify.extended_model import load_extended
@@ -290,26 +294,24 @@ def effects_in(command: Identify, scene: Scene) -> tuple[Scene, tuple[Effect, ..
 
 
 def needs_one(command: Identify) -> None:
-    """ValueError where effects come from two places."""
+    """ValueError if both --extended and --effects are given."""
     if command.extended is not None and command.effects:
-        raise ValueError("--extended brings effects of its own: give it or --effects")
+        raise ValueError("--extended and --effects both add effects: give one of them")
 
 
 def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:
-    """The recordings to fit, none where the synthetic robot shall record, and those to judge on; ValueError where two
-    have one name.
-    """
+    """The recordings to fit (none for the synthetic robot) and the test recordings; ValueError for equal names."""
     needs_recording(command)
     if command.judge_on and not command.recording:
-        raise ValueError("--judge-on needs --recording: the synthetic robot is judged on its own repeats")
+        raise ValueError("--test-recording needs --recording: the synthetic robot is tested on its own repeats")
     files: dict[str, Path] = {}
     paths = (*command.recording, *command.judge_on)
     recordings = [recording_at(path) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
         if recording.name in files:
             raise ValueError(
-                f"{files[recording.name]} and {path} are both named {recording.name!r}, and results go by the name: "
-                f"`python -m droid_jax.run convert {path} --name OTHER --out other.npz` gives another"
+                f"{files[recording.name]} and {path} are both named {recording.name!r}, but results refer to "
+                f"recordings by name: `python -m droid_jax.run convert {path} --name OTHER --out other.npz` changes it"
             )
         files[recording.name] = path
     count = len(command.recording)
@@ -317,7 +319,7 @@ def _given(command: Identify) -> tuple[list[Recording], list[Recording]]:
 
 
 def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
-    """ValueError for a demonstration that there is none of."""
+    """ValueError for an unknown demonstration."""
     from droid_jax.door.demonstration import demonstration_path
 
     for name in () if given else command.demonstrations or ():
@@ -327,12 +329,14 @@ def _needs_demonstrations(command: Identify, given: list[Recording]) -> None:
 def _recordings(
     command: Identify, scene: Scene, out: Path, given: list[Recording]
 ) -> tuple[list[Recording], dict[str, float] | None, dict[str, Any]]:
-    """The given recordings, or the synthetic robot's (kept in the run's folder); with its hidden truth and, of given
-    ones, springs, seed and hidden effects where these are known."""
+    """The recordings to fit, the synthetic robot's true values, and the robot's springs, seed and hidden effects.
+
+    Recordings of the synthetic robot are stored in the run's folder.  True values are None if they are unknown.
+    """
     from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import is_synthetic, synthetic_truth
 
-    if given:  # a robot's own may lie beside what is known of a synthetic robot
+    if given:  # real recordings may lie in the same folder as a synthetic_robot.json
         synthetic_robot = command.scene is None and all(is_synthetic(r) for r in given)
         known = known_robot(command.recording) if synthetic_robot else {}
         return given, synthetic_truth(scene, known["springs"], known["seed"]) if known else None, known
@@ -343,7 +347,7 @@ def _recordings(
     gains = "paper" if command.preset == "paper" else "impedance"
     truth = synthetic_truth(scene, command.springs, command.seed, nuisances=command.preset != "paper")
 
-    def recorded(name: str) -> Recording:  # as `record` does, whatever stands beside it
+    def recorded(name: str) -> Recording:  # the same seed as in `record`
         demonstration = load_recording(demonstration_path(name, gains=gains))
         return record(scene, demonstration, truth, seed=1000 * command.seed + sorted(PLANS).index(name))
 
@@ -353,7 +357,7 @@ def _recordings(
 
 
 def _summary(found: Identified, fit: FitFile, repeats: Sequence[int]) -> None:
-    """A few lines that say how it went; fit: fit.json; repeats: of each recording."""
+    """Print the summary of a fit; fit: content of fit.json; repeats: their number in each recording."""
     from droid_jax.identify.solution_checks import solution_notes
     from droid_jax.report.identify_page import asked_of, far_off, lacks_something, needed, noiseless
     from droid_jax.report.text import lines

@@ -1,4 +1,4 @@
-"""What options that several commands share stand for: a preset, a scene and recordings of your own, your effects."""
+"""Options that several commands share: presets, your own scene and recordings, your own effects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+
+import tyro
 
 from droid_jax.report.stages import setup
 
@@ -23,12 +25,14 @@ if TYPE_CHECKING:
 Channel = Literal["torque", "position", "velocity", "object_angle"]
 Preset = Literal["quick", "standard", "paper", "gpu"]
 JointFriction = Literal["held", "scene"]
+# Kept as the field `judge_on`, by which setup.json of earlier runs knows it; --judge-on is its earlier name.
+TestRecordings = Annotated[tuple[Path, ...], tyro.conf.arg(name="test-recording", aliases=("--judge-on",))]
 TIMESTEP: dict[Preset, float] = {"quick": 0.004, "standard": 0.002, "paper": 0.002, "gpu": 0.002}  # s, built-in door
 
 
 @functools.cache
 def warn_of_cpu(preset: str) -> None:
-    """Say once where the preset for a GPU runs on a CPU; jax must be tuned already."""
+    """Warn once if the preset for a GPU runs on a CPU; jax must be tuned already."""
     import jax
 
     if preset == "gpu" and jax.default_backend() == "cpu":
@@ -39,7 +43,7 @@ def warn_of_cpu(preset: str) -> None:
 
 
 def search_config(preset: Preset, seed: int, **changes: int | None) -> CmaConfig:
-    """The preset's search; changes: fields of CmaConfig that were asked for, None for those that were not."""
+    """The preset's search; changes: fields of CmaConfig given by options, None if not given."""
     from droid_jax.identify.search import CmaConfig
 
     chosen: dict[str, int | None] = {
@@ -62,7 +66,7 @@ def refine_config(preset: Preset) -> RefineConfig | None:
 
 
 class OwnScene(Protocol):
-    """The options that describe it, and what was measured in it."""
+    """The options that describe your own scene, and its recordings."""
 
     @property
     def recording(self) -> tuple[Path, ...]: ...
@@ -79,21 +83,21 @@ class OwnScene(Protocol):
 
 
 def needs_scene(options: OwnScene) -> None:
-    """ValueError for options that describe a scene of your own where none is given."""
+    """ValueError for options of your own scene without --scene."""
     given = {name: getattr(options, name) for name in ("parameters", "joints", "object_joint")}
     for name, value in {**given, "joint_friction": options.joint_friction != "held"}.items():
         if options.scene is None and value:
-            raise ValueError(f"--{name.replace('_', '-')} is for a scene of your own: give --scene too")
+            raise ValueError(f"--{name.replace('_', '-')} is for your own scene: give --scene too")
 
 
 def needs_recording(options: OwnScene) -> None:
-    """ValueError for a scene of your own in which nothing was measured."""
+    """ValueError for your own scene without recordings."""
     if options.scene is not None and not options.recording:
         raise ValueError("--scene needs --recording: the synthetic robot only knows the built-in door")
 
 
 def needs_log(motion_cutoff: float | None, recordings: Sequence[Recording]) -> None:
-    """ValueError for a --motion-cutoff that is none, or that filters nothing: a synthetic robot has commands."""
+    """ValueError for an invalid --motion-cutoff, or one without a log to filter."""
     if motion_cutoff is None:
         return
     if not motion_cutoff > 0:
@@ -103,7 +107,7 @@ def needs_log(motion_cutoff: float | None, recordings: Sequence[Recording]) -> N
 
 
 def compared(motion_cutoff: float | None, **changes: Any) -> CompareConfig:
-    """How recordings are compared, with what the command line says of it."""
+    """Configuration of the comparison with the given options."""
     from droid_jax.cost.residuals import CompareConfig
 
     usual = CompareConfig(**changes)
@@ -111,7 +115,7 @@ def compared(motion_cutoff: float | None, **changes: Any) -> CompareConfig:
 
 
 def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) -> tuple[Scene, Space]:
-    """The scene and its listed parameters, nuisances among them; ValueError for what the files or names lack.
+    """Your own scene and the parameters of its list, including nuisances; ValueError for invalid files or names.
 
     engine, mj_step: of the replays.
     """
@@ -133,7 +137,7 @@ def own_scene(options: OwnScene, *, engine: str = "mjx", mj_step: bool = False) 
 
 
 def recording_at(path: Path) -> Recording:
-    """A recording; ValueError for ROS bags, which do not say what a fit must know of them."""
+    """The recording in a file; ValueError for ROS bags, which lack information that a fit needs."""
     from droid_jax.recordings.formats import bags_at, load_recording
 
     if bags_at(path):
@@ -145,20 +149,20 @@ def recording_at(path: Path) -> Recording:
 
 
 def load_effects(path: Path | None, *folders: Path | None) -> None:
-    """Run a file of effects of your own, which are in the library from then on (docs/your-effect.md).
+    """Execute a file that registers your own effects in the library (docs/your-effect.md).
 
-    folders: of runs that are read: one that was made with such effects needs them.  Its setup.json is not followed to
-    the file: results that come from elsewhere run no code.
-    Raises ValueError where the file is missing, fails, or a folder needs one and none is given.
+    folders: of runs that are read.  A run with such effects needs the file.  Its path in setup.json is not used, so
+    that results from elsewhere execute no code. Raises ValueError if the file is missing, fails, or is needed by a
+    folder and not given.
     """
     if path is None:
         for folder in (f for f in folders if f is not None):
             if file := setup(folder).get("user_effects"):
-                raise ValueError(f"{folder} was made with effects of your own: give --user-effects {file}")
+                raise ValueError(f"{folder} was made with your own effects: give --user-effects {file}")
         return
     if not path.is_file():
         raise ValueError(f"--user-effects: there is no file {path}")
-    # One name for one file: read again by the next stage of `all`, it registers the same effects and no others.
+    # One module name per file: the next stage of `all` registers the same effects again.
     name = f"user_effects_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:

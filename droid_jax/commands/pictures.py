@@ -18,15 +18,14 @@ if TYPE_CHECKING:
     from droid_jax.recordings.recording import Recording
 
 RATE = 25.0  # states per second
-AT = (0.0, 0.33, 0.6, 1.0)  # of the motion, where a frame is taken
+FRAME_TIMES = (0.0, 0.33, 0.6, 1.0)  # of the motion, at which frames are drawn
 FRAMES = "frames"
 
 
 def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
-    """Replay a recording's commands in plain C before and after the fit, into replay.npz, beside the measured motion.
+    """Write replay.npz: a recording's commands replayed in plain C before and after the fit, and the measured motion.
 
-    It and the pictures of an earlier fit in this folder are removed first.  A recording without commands has no replay
-    to show.
+    The replay and the pictures of an earlier fit are removed first.  A recording without commands has no replay.
     """
     import numpy as np
 
@@ -52,7 +51,7 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
 
 
 def measured_states(scene: Scene, recording: Recording, time: np.ndarray, else_: np.ndarray) -> dict[str, np.ndarray]:
-    """What a replay's file says of the measured motion; empty where no joint's position was measured.
+    """The measured motion for replay.npz; empty if no joint's position was measured.
 
     Args:
         scene: that was replayed.
@@ -81,9 +80,9 @@ def measured_states(scene: Scene, recording: Recording, time: np.ndarray, else_:
 
 
 def draw_replay(out: Path, scene: Scene) -> None:
-    """Draw what replay.npz holds, as film, frames and viewer, where there is one that was not drawn yet.
+    """Draw the film, the frames and the viewer of replay.npz, unless they exist.
 
-    Where that cannot be done (no OpenGL, a replay that blew up) it is said, and the page has no pictures.
+    If this fails (no OpenGL, a diverged replay) a message is printed, and the page has no pictures.
     """
     from droid_jax.report.reading import Reader, read_replay
     from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
@@ -96,7 +95,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
         time, before, after = read_replay(out / REPLAY, Reader("identify"))
         model = scene.visual_model()
         camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
-        rows = [int(f * (len(after) - 1)) for f in AT]
+        rows = [int(f * (len(after) - 1)) for f in FRAME_TIMES]
         images = rendered_frames(model, after, rows, camera)
         period = float(time[1]) if len(time) > 1 else 1.0 / RATE
         drawn = film(out / FILMS / REPLAY_FILM, model, (before, after), period, camera)
@@ -104,7 +103,7 @@ def draw_replay(out: Path, scene: Scene) -> None:
     except (NoOpenGL, ValueError) as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
-    with new_folder(out / FRAMES) as folder:  # last: it says that all is drawn
+    with new_folder(out / FRAMES) as folder:  # last: it marks that everything is drawn
         save_frames(folder, images, [float(time[r]) for r in rows], "after")
 
 

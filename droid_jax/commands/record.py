@@ -1,4 +1,4 @@
-"""`record`: the synthetic robot repeats a demonstration."""
+"""`record`: recordings of the synthetic robot."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class Record:
     """Record the synthetic robot (plain C MuJoCo with hidden physics): repeats of a demonstration, as an npz file."""
 
     demonstration: str = "A"
-    """A, B or C."""
+    """Demonstration: A, B or C."""
     springs: Literal[0, 1, 2] = 1
     """Springs on the door."""
     repeats: int = 10
-    """How often the motion is repeated."""
+    """Number of repeats."""
     seed: int = 0
     """Seed of the robot's hidden errors and of its noise."""
     gains: Literal["impedance", "paper"] = "impedance"
@@ -26,7 +26,7 @@ class Record:
 
 
 def run(command: Record) -> None:
-    """Record the synthetic robot and save what it measured."""
+    """Record the synthetic robot and save the recording."""
     from droid_jax.door.demonstration import PLANS, demonstration_path
     from droid_jax.door.scene import door_scene
     from droid_jax.recordings.formats import check_target, load_recording, save_recording
@@ -36,7 +36,7 @@ def run(command: Record) -> None:
     scene = door_scene(springs=command.springs, gains=command.gains)
     demonstration = load_recording(demonstration_path(command.demonstration, gains=command.gains))
     truth = synthetic_truth(scene, command.springs, command.seed)
-    # one robot, whose demonstrations have noise and errors of grasp of their own
+    # One robot; each demonstration has its own noise and grasp errors.
     seed = 1000 * command.seed + sorted(PLANS).index(command.demonstration)
     recording = record(scene, demonstration, truth, seed=seed, config=SyntheticRobotConfig(repeats=command.repeats))
     of = {"springs": str(command.springs), "robot": str(command.seed)}

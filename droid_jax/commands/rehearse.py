@@ -1,4 +1,4 @@
-"""`rehearse`: would this work on my robot, with this motion?"""
+"""`rehearse`: predicts what a search with these motions would find."""
 
 from __future__ import annotations
 
@@ -37,35 +37,34 @@ if TYPE_CHECKING:
     from droid_jax.rehearsal.linearised import Rehearsed
     from droid_jax.rehearsal.plan import RehearsalPlan
 
-DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # rehearsed where no recording is given: train, validation
+DOOR_MOTIONS, DOOR_REPEATS = ("C", "B"), 10  # train and validation motion if no recording is given
 
 
 @dataclass(frozen=True)
 class Rehearse:
-    """Would this work on my robot, with this motion? Which parameters would be identifiable, which effects
-    found, and from which size?
+    """Predict which parameters would be identifiable and which effects would be found, from which size, with these
+    motions.
 
-    Quick, without fits: from what each parameter and each effect changes, beside the noise. --full makes synthetic
-    logs with something hidden, and fits and searches them.
+    Quick, without fits: from the sensitivity of the replay to each parameter and effect, and the noise. --full makes
+    synthetic logs with hidden effects, and fits and searches them.
     """
 
     recording: tuple[Path, ...] = ()
-    """Recordings as `gap` takes them. Their commands and their noise are used, or their commands alone (--repeats).
-    Default: two motions of the built-in door."""
+    """Recordings as in `gap`. Their commands and noise are used, or only their commands (--repeats). Default: two
+    motions of the built-in door."""
     repeats: int | None = None
-    """Rehearse so many repeats of each motion: what was measured is replaced by what the scene makes of the
-    commands."""
+    """Number of repeats of each motion. The measurements are then replaced by simulated ones."""
     noise: tuple[str, ...] = ()
-    """channel=deviation of one sample, for example torque=0.05 position=1e-4, in N m, rad, m or per second. Default: as
-    the repeats scatter, else as for a Panda."""
+    """Noise deviation of one sample, CHANNEL=DEVIATION, for example torque=0.05 position=1e-4, in N m, rad, m or per
+    second. Default: estimated from the scatter of the repeats, otherwise that of a Panda."""
     fit: Path | None = None
-    """Folder of a finished `identify`: parameters stand there instead of at their initial means."""
+    """Folder of a finished `identify`, whose values are used instead of the initial means."""
     full: int = 0
-    """Make so many complete rehearsals: synthetic logs, fitted and searched. Each takes as long as `gap` does."""
+    """Number of complete rehearsals: synthetic logs, fitted and searched. Each takes as long as `gap`."""
     compare: tuple[Channel, ...] = ()
     """Measured channels to compare; default: as in gap."""
     preset: Literal["quick", "standard", "gpu"] = "quick"
-    """Of the fits of --full, as in identify."""
+    """Preset of the fits of --full, as in identify."""
     scene: Path | None = None
     """Your own MJCF instead of the built-in door."""
     parameters: Path | None = None
@@ -73,7 +72,7 @@ class Rehearse:
     joints: tuple[str, ...] = ()
     """Measured joints of your own scene; default: all driven joints."""
     object_joint: str | None = None
-    """Joint of the thing that is moved, in your own scene."""
+    """Joint of the object that is moved, in your own scene."""
     joint_friction: JointFriction = "held"
     """Dry friction of your own scene's joints, as in gap."""
     effects: tuple[str, ...] = ()
@@ -83,22 +82,22 @@ class Rehearse:
     effect_scale: float = 1.0
     """Forces and torques of the library's effects, as in gap."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     seed: int = 0
     """Seed of the drawn noise and of the hidden robots."""
     out: Path = Path("runs/rehearse")
-    """Folder of rehearsal.html and rehearsal.json. Rehearsals of --full that are there are not made again."""
+    """Folder of rehearsal.html and rehearsal.json. Existing rehearsals of --full are not repeated."""
 
 
 @writes(None)
 def run(command: Rehearse) -> None:
-    """Rehearse, write page and JSON, and say the answer."""
+    """Rehearse, write page and JSON, and print the summary."""
     from droid_jax import runtime
 
     needs_scene(command)
     needs_recording(command)
     if command.full < 0 or (command.repeats is not None and command.repeats < 1):
-        raise ValueError("--full and --repeats count: give whole numbers above 0")
+        raise ValueError("--full and --repeats must be whole numbers above 0")
     runtime.start()
     if command.full:
         warn_of_cpu(command.preset)
@@ -114,9 +113,9 @@ def run(command: Rehearse) -> None:
     plan = plan_of(command, base, fit)
     effects = chosen_effects(gap, scene, recordings, plan.channels or ())
     config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
-    found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _tell)
+    found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _print_stage)
     setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}
-    if plan.values:  # out of a fit, which may be made again in its folder
+    if plan.values:  # from a fit, whose folder may later hold another one
         setup["values"] = dict(plan.values)
     if command.full:
         result |= _full(command, scene, base, effects, recordings, plan, config, rehearsal, found, result, setup)
@@ -131,7 +130,7 @@ def run(command: Rehearse) -> None:
 
 
 def as_gap(command: Rehearse) -> GapCommand:
-    """The search that is rehearsed."""
+    """The options of the search that is rehearsed."""
     channels = command.compare
     if not command.recording and not channels:
         channels = ("torque",)
@@ -152,7 +151,7 @@ def as_gap(command: Rehearse) -> GapCommand:
 
 
 def rehearsed_recordings(command: Rehearse) -> list[Recording]:
-    """Those given, or two motions of the built-in door."""
+    """The given recordings, or two motions of the built-in door."""
     if command.recording:
         return [recording_at(path) for path in command.recording]
     from droid_jax.door.demonstration import demonstration_path
@@ -162,7 +161,7 @@ def rehearsed_recordings(command: Rehearse) -> list[Recording]:
 
 
 def plan_of(command: Rehearse, base: Space, fit: Path | None) -> RehearsalPlan:
-    """What the options say of noise, repeats, channels and values."""
+    """The plan that the options describe: noise, repeats, channels and values."""
     from droid_jax.cost.channels import SIMULATED
     from droid_jax.rehearsal.plan import RehearsalPlan
 
@@ -200,12 +199,12 @@ def _full(
     quick: Mapping[str, Any],
     setup: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The complete rehearsals and their scores."""
+    """Results and scores of the complete rehearsals."""
     from droid_jax.identify.pipeline import IdentifyConfig
     from droid_jax.rehearsal.full import FullRehearsal, hidden_cases, run_cases, scores
 
     if not all(r.command.size for r in recordings):
-        raise ValueError("--full needs recordings with commands: a log without them prescribes its motion")
+        raise ValueError("--full needs recordings with commands: without them the motion cannot be simulated")
     identify = IdentifyConfig(
         search=search_config(command.preset, command.seed), refine=refine_config(command.preset), samples=0
     )
@@ -216,14 +215,14 @@ def _full(
     decides = {k: v for k, v in setup.items() if k != "full"}
     name = hashlib.sha256(json.dumps(plain(decides), sort_keys=True).encode()).hexdigest()[:12]
     if any(p.name != name for p in (command.out / "rehearsals").glob("*")):
-        print(f"{command.out / 'rehearsals'} also holds rehearsals of other settings or another fit; they do not count")
+        print(f"{command.out / 'rehearsals'} also holds rehearsals of other settings or another fit, which are ignored")
     cases = hidden_cases(scene, quick["effects"], command.full, rehearsal)
     results = run_cases(of, cases, command.out / "rehearsals" / name, lambda said: print(said, flush=True))
     return {"form": "full", "full": scores(results, rehearsal.share), "cases": results}
 
 
 def plain(value: Any) -> Any:
-    """Plain data for JSON: no infinities and no arrays."""
+    """The value as plain data for JSON, without infinities and arrays."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -233,12 +232,12 @@ def plain(value: Any) -> Any:
     return finite(value) if isinstance(value, float) else value
 
 
-def _tell(stage: str) -> None:
+def _print_stage(stage: str) -> None:
     print(f"{stage} ...", flush=True)
 
 
 def _show(result: Mapping[str, Any]) -> None:
-    """The tables and the sentences on the terminal."""
+    """Print the tables and the sentences."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -247,8 +246,12 @@ def _show(result: Mapping[str, Any]) -> None:
 
     console = Console()
     for title, head, rows in (
-        ("parameters", ("parameter", "of the prior's width left", "recovered", "trades with"), parameter_rows(result)),
-        ("effects", ("effect", "place", "found from", "decided by", "taken for"), effect_rows(result)),
+        (
+            "parameters",
+            ("parameter", "posterior width, of the prior's", "recovered", "correlated with"),
+            parameter_rows(result),
+        ),
+        ("effects", ("effect", "location", "found from", "limited by", "confused with"), effect_rows(result)),
     ):
         table = Table(title=title)
         for name in head:

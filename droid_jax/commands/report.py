@@ -1,4 +1,4 @@
-"""`report`: a run's page once more."""
+"""`report`: rebuilds a run's page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Report:
     """Build the HTML page of a finished run again."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """The run's folder. Default: of runs/identify, runs/gap, runs/train and runs/all the one that was finished last."""
+    """The run's folder. Default: the one of runs/identify, runs/gap, runs/train and runs/all that was finished last."""
 
 
 def run(command: Report) -> None:
@@ -28,11 +28,11 @@ def run(command: Report) -> None:
 
 
 def _latest() -> Path:
-    """The folder below RUNS whose run was finished last; ValueError where there is none."""
+    """The folder below RUNS whose run was finished last; ValueError if there is none."""
     files = {RUNS / stage / last: RUNS / stage for stage, last in LAST_FILES.items()}
     files |= {RUNS / "all" / stage / last: RUNS / "all" for stage, last in LAST_FILES.items()}
     whole = [file for file in files if file.is_file()]
     if not whole:
         folders = ", ".join(map(str, dict.fromkeys(files.values())))
-        raise ValueError(f"there is no finished run in {folders}: give the folder of one")
+        raise ValueError(f"there is no finished run in {folders}: give its folder")
     return files[max(whole, key=lambda file: file.stat().st_mtime)]

@@ -1,4 +1,4 @@
-"""What a policy is trained on: the distribution in a run's folder, with the scene and the effects that belong to it."""
+"""The distribution in a run's folder from which training draws, with its scene and its effects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     """The scene to train in, the Gaussian in a folder of `identify`, `gap` or `train`, and the effects of its model.
 
     folder: None for the prior of the built-in door.
-    Raises ValueError where the folder holds no Gaussian, one of another scene or servo, or a run that is not whole.
+    Raises ValueError if the folder has no Gaussian, one of another scene or servo, or an incomplete run.
     """
     from droid_jax.door.scene import door_scene
     from droid_jax.door.space import door_nuisances, door_space
@@ -40,7 +40,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     from droid_jax.identify.gaussian import load_gaussian, prior
 
     scene = door_scene(timestep=TIMESTEP, limits=True, knob=knob)
-    if folder is None:  # over what a fit is over, so that what a policy meets differs in nothing but the ranges
+    if folder is None:  # the same parameters as in a fit, so that methods differ only in the distribution
         return scene, prior(door_space(scene) + door_nuisances(scene)), ()
     needs_whole(folder)
     other = setup(folder)
@@ -54,7 +54,7 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
             raise ValueError(f"{folder} holds no {GAUSSIAN}: it is no folder of `identify`, `gap` or `train`")
         if other.get("effects"):
             raise ValueError(
-                f"{folder} was fitted with --effects {' '.join(other['effects'])}, which no extended model brings: "
+                f"{folder} was fitted with --effects {' '.join(other['effects'])}, which no extended model has: "
                 "train on a folder of `gap`, or on a fit with --extended"
             )
         own = load_gaussian(at)
@@ -64,14 +64,14 @@ def source(folder: Path | None, knob: int) -> tuple[Scene, Gaussian, tuple[Effec
     own = load_gaussian(at) if at.is_file() else extended.gaussian
     lacking = {name for part in extended.parts for name in part.free} - set(own.space.names)
     if lacking:
-        raise ValueError(f"{at} lacks {', '.join(sorted(lacking))} of {model}, which is of another search by now")
+        raise ValueError(f"{at} lacks {', '.join(sorted(lacking))} of {model}, which now is of another search")
     return extended.scene, own, extended.effects
 
 
 def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
-    """ValueError where a Gaussian speaks of something else than the built-in door's parameters.
+    """ValueError for a Gaussian over other parameters than the built-in door's.
 
-    Its entries of the model may exist here too and mean another joint.
+    Entries of the model with the same index may belong to another joint.
     """
     from droid_jax.door.space import door_nuisances, door_space
 
@@ -84,17 +84,16 @@ def _check_door(path: Path, gaussian: Gaussian, scene: Scene) -> None:
 
 
 class _Verdict(TypedDict):
-    """What training reads of a gap.json."""
+    """The entries of gap.json that training reads."""
 
     effects: list[dict[str, str]]
 
 
 def model_folder(whole: Path) -> Path:
-    """Where, in a folder of `all`, the model is that a policy shall be trained on: the extended one, if an effect was
-    named.
+    """Folder, below one of `all`, of the model to train on: that of `gap` if an effect was named, else `identify`.
 
-    A search in other recordings than the fit's, left over from an earlier run, does not count.
-    Raises ValueError for a verdict that cannot be read.
+    A search of an earlier run in other recordings than the fit's is ignored.
+    Raises ValueError for a damaged gap.json.
     """
     path = whole / "gap" / GAP
     try:
@@ -105,14 +104,14 @@ def model_folder(whole: Path) -> Path:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether there is something in a folder that a policy can be trained on."""
+    """Whether a folder has a Gaussian or an extended model to train on."""
     if unfinished(folder):
         return False
     return gaussian_of(folder).is_file() or extended_of(folder) is not None
 
 
 def untrainable(folder: Path) -> tuple[str, ...]:
-    """Effects of a folder's extended model that no policy can be trained with: `DoorEnv` has no whole command yet."""
+    """Effects of a folder's extended model that need the whole command in advance, so that no policy can be trained."""
     from droid_jax.door.scene import door_scene
     from droid_jax.identify.extended_model import load_extended
 
@@ -123,13 +122,13 @@ def untrainable(folder: Path) -> tuple[str, ...]:
 
 
 def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:
-    """Which synthetic robot a fit was made of, if it was one: its springs, seed and hidden effects."""
+    """Springs, seed and hidden effects of the fitted synthetic robot; empty for a real robot."""
     known = {} if folder is None else setup(folder)
     if known.get("command") == "train":
         return known.get("synthetic_robot", {})
     if kept := _robot(folder):
         return kept
-    if known.get("recording"):  # not kept by this run: as named where it ran; those of `all` lie beside its stages
+    if known.get("recording"):  # paths as given to that run; in a folder of `all`, next to its stages
         beside = [folder.parent / "recordings" / Path(name).name for name in known["recording"]] if folder else []
         hashes = known.get("recordings_sha256", [])
         return next((known_robot(at) for at in (known["recording"], beside) if _hold(at, hashes)), {})
@@ -137,17 +136,15 @@ def synthetic_robot_of(folder: Path | None) -> dict[str, Any]:
 
 
 def _robot(folder: Path | None) -> dict[str, Any]:
-    """The same as a finished run of `identify` or `gap` keeps it; empty where it does not."""
+    """The synthetic robot stored in config.json or gap.json; empty if there is none."""
     if folder is None:
         return {}
-    told = (described_in(folder / CONFIG), described_in(folder / GAP).get("setup", {}))
-    return next((of["robot"] for of in told if of.get("synthetic_robot") and of.get("robot")), {})
+    described = (described_in(folder / CONFIG), described_in(folder / GAP).get("setup", {}))
+    return next((of["robot"] for of in described if of.get("synthetic_robot") and of.get("robot")), {})
 
 
 def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
-    """Whether these files are there and hold a synthetic robot's recordings of these hashes: others may have
-    their names.
-    """
+    """Whether these files exist and are a synthetic robot's recordings with these hashes."""
     from droid_jax.recordings.formats import load_recording
     from droid_jax.synthetic.robot import is_synthetic
 
@@ -159,5 +156,5 @@ def _hold(paths: Sequence[str | Path], hashes: Sequence[str]) -> bool:
 
 
 def needs_brax() -> None:
-    """ValueError that says what to install where brax is not."""
+    """ValueError with the installation command if brax is missing."""
     needs("policies need", "train", "brax")

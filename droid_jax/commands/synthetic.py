@@ -1,4 +1,4 @@
-"""The synthetic robot: its options, and one with something hidden in it for a `gap` without recordings."""
+"""The synthetic robot: its options, and its recordings with a hidden effect for `gap` without --recording."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ if TYPE_CHECKING:
 
 DEMONSTRATIONS = {"train": "C", "validation": "B", "test": "A"}
 HIDE = ("magnetic_catch=1.5",)  # N m
-# Options of a synthetic robot, as they are where not given.
+# Defaults of the options of a synthetic robot.
 OPTIONS = {"hide": None, "springs": 1, "demonstrations": ("A", "C")}
 
 T = TypeVar("T")
 
 
 def with_robot_options(command: T) -> T:
-    """A command with the options of its synthetic robot filled in, where it records one.
+    """The command with defaults for the options of its synthetic robot, if it records one.
 
-    Raises ValueError where some were given beside recordings, which come from another robot.
+    Raises ValueError if such options and --recording are both given.
     """
     usual = {name: value for name, value in OPTIONS.items() if hasattr(command, name)}
     if "demonstrations" in usual and command.preset == "paper":  # type: ignore[attr-defined]
-        usual["demonstrations"] = ("A",)  # one is fitted there
+        usual["demonstrations"] = ("A",)  # the paper fits one demonstration
     given = [name for name in usual if getattr(command, name) is not None]
     if not command.recording:  # type: ignore[attr-defined]
         return replace(command, **{k: v for k, v in usual.items() if k not in given})  # type: ignore[type-var]
     if given:
-        raise ValueError(f"--{given[0]} is for the synthetic robot, and --recording says that there is none")
+        raise ValueError(f"--{given[0]} is for the synthetic robot, which is not recorded with --recording")
     return command
 
 
 def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, float]:
-    """What --hide says: name or name[joint] -> amplitude.
+    """The hidden effects of --hide: name or name[joint] -> coefficient.
 
-    entries: "name=amplitude" each, or "none" alone; None: one effect of this program's choice.
-    Raises ValueError for what they cannot mean, listing the valid names, and for what the scene cannot have.
+    entries: "name=coefficient" each, or only "none"; None: the default effect.
+    Raises ValueError for invalid entries, listing the valid names, and for effects that the scene cannot have.
     """
     from droid_jax.synthetic.hidden_effects import as_applied, check, hidden_effect, possible
 
@@ -70,9 +70,9 @@ def hidden_effects(entries: Sequence[str] | None, scene: Scene) -> dict[str, flo
 def record_synthetic(
     scene: Scene, hidden: Mapping[str, float], out: Path, springs: int, seed: int, again: bool
 ) -> dict[str, Recording]:
-    """Role -> what the synthetic robot measured; kept in the run's folder.
+    """Role -> recording of the synthetic robot, stored in the run's folder.
 
-    Recorded anew where `again` asks for it, and where the folder is not known to hold recordings of this very robot.
+    They are recorded again with `again`, or if the folder is not known to have recordings of this robot.
     """
     from droid_jax.door.demonstration import demonstration_path
     from droid_jax.recordings.formats import load_recording
@@ -94,7 +94,7 @@ def record_synthetic(
     if again or known_robot(files) != this:
         for path in paths.values():
             path.unlink(missing_ok=True)
-    # Before the first: a stop leaves no recordings of an unknown robot.
+    # Written before the first recording, so that a stop leaves no recordings of an unknown robot.
     write_json(out / "recordings" / SYNTHETIC_ROBOT, this)
     found = kept_recordings(paths, False, recorded)
     return {role: found[name] for role, name in DEMONSTRATIONS.items()}
@@ -106,12 +106,12 @@ def kept_at(out: Path) -> tuple[Path, ...]:
 
 
 def robot_json(hidden: Mapping[str, float], springs: int, seed: int) -> dict[str, Any]:
-    """What is known of the synthetic robot that made some recordings."""
+    """Content of synthetic_robot.json: springs, seed and hidden effects."""
     return {"springs": springs, "seed": seed, "hide": [f"{name}={amplitude:g}" for name, amplitude in hidden.items()]}
 
 
 def known_robot(recordings: Sequence[str | Path]) -> dict[str, Any]:
-    """Springs, seed and hidden effects of the synthetic robot that made these files; empty where that is not known."""
+    """Springs, seed and hidden effects of the synthetic robot that made these files; empty if unknown."""
     folders = {Path(path).resolve().parent for path in recordings}
     try:
         at = folders.pop() / SYNTHETIC_ROBOT
@@ -121,7 +121,7 @@ def known_robot(recordings: Sequence[str | Path]) -> dict[str, Any]:
 
 
 def _of_meta(recordings: Sequence[str | Path]) -> dict[str, Any]:
-    """The same from what `record` wrote into the files themselves, where they all say the same."""
+    """The same from the `meta` that `record` writes, if all files agree."""
     from droid_jax.recordings.formats import load_recording
 
     try:

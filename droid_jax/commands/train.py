@@ -27,28 +27,28 @@ Method = Literal["fitted", "mean", "prior"]
 class Train:
     """Train a policy with PPO on doors drawn from a Gaussian: the fitted one, or the prior.
 
-    With --fit it is the Gaussian that `identify` fitted, nuisances included, or the extended model that `gap` found.
+    --fit names the Gaussian of `identify`, nuisances included, or the extended model of `gap`.
     """
 
     fit: Path | None = None
-    """Folder of `identify`, `gap` or `all`. Default: runs/identify where it holds a fit, else runs/all."""
+    """Folder of `identify`, `gap` or `all`. Default: runs/identify if it has a fit, otherwise runs/all."""
     method: Method = "fitted"
-    """fitted: every environment its own draw of the fitted Gaussian.  mean: all have its mean.  prior: draws of what
-    was assumed before the fit (the three methods of the paper's Table II)."""
+    """fitted: each environment has a draw from the fitted Gaussian.  mean: all have its mean.  prior: draws from the
+    prior (the three methods of the paper's Table II)."""
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """quick: a laptop, minutes.  paper: longer.  gpu: 4096 environments."""
+    """quick: minutes on a laptop.  paper: longer.  gpu: 4096 environments."""
     knob: Literal[0, 1, 2, 3] = 0
-    """Where the knob is along the door, each 5 cm nearer to the hinge than the one before."""
+    """Location of the knob along the door, each 5 cm nearer to the hinge than the one before."""
     steps: int | None = None
-    """Actions in all, rounded up to whole rounds; default: the preset's."""
+    """Total number of actions, rounded up to whole rounds; default: the preset's."""
     seed: int = 0
     """Seed of the networks and of the environments."""
     user_effects: Path | None = None
-    """Python file that registers effects of your own (docs/your-effect.md); it is run."""
+    """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     tensorboard: bool = False
     """Write scalars for TensorBoard while it runs, to OUT/tensorboard."""
     out: Path = Path("runs/train")
-    """Results folder. A run that was interrupted goes on from its last checkpoint."""
+    """Results folder. An interrupted run continues from its last checkpoint."""
     again: bool = False
     """Start over, even if the folder holds a finished or interrupted run."""
 
@@ -107,12 +107,14 @@ def run(command: Train) -> None:
         held = f"{config.held} evaluations in a row had {config.enough:.0%} success or more"
         why = held if found.held else "its weights became NaN or infinite"
         print(f"training ended after {done} of {config.steps} actions: {why}")
-    write_json(out / TRAINING, _description(setup, config, env, found))  # last: its presence says that the run is whole
+    write_json(
+        out / TRAINING, _description(setup, config, env, found)
+    )  # last: its presence means that the run is complete
     report.run(report.Report(out))
 
 
 def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found: TrainedPolicy) -> dict[str, Any]:
-    """What training.json says."""
+    """Content of training.json."""
     from droid_jax import runtime
 
     return {
@@ -130,7 +132,7 @@ def _description(setup: dict[str, Any], config: TrainConfig, env: DoorEnv, found
 
 
 def train_config(command: Train) -> TrainConfig:
-    """The preset with the command's own numbers."""
+    """The preset's configuration with the numbers given by options."""
     from droid_jax.policy.train import PRESETS
 
     asked = {} if command.steps is None else {"steps": command.steps}
@@ -144,9 +146,9 @@ def _chosen(command: Train, gaussian: Gaussian) -> Gaussian:
 
 
 def _fit_folder(command: Train) -> Path | None:
-    """Where the Gaussian comes from; None for the prior of the built-in door.
+    """Folder of the Gaussian; None for the prior of the built-in door.
 
-    Raises ValueError where a fit is asked for and there is none.
+    Raises ValueError if a fit is needed and there is none.
     """
     if command.fit is not None:
         if not command.fit.is_dir():
@@ -155,7 +157,7 @@ def _fit_folder(command: Train) -> Path | None:
         return whole if has_model(whole) else command.fit
     for folder in (RUNS / "identify", model_folder(RUNS / "all")):
         if has_model(folder):
-            what = "what was assumed before the fit" if command.method == "prior" else "the fit"
+            what = "the prior of the fit" if command.method == "prior" else "the fit"
             print(f"training on {what} in {folder} (another: --fit)")
             return folder
     if command.method != "prior":

@@ -22,29 +22,29 @@ if TYPE_CHECKING:
     import mujoco
     import numpy as np
 
-APART = 1.6  # times the scene's extent between the two
+DISTANCE = 1.6  # between the two copies, relative to the scene's extent
 
 
 @dataclass(frozen=True)
 class View:
-    """Watch the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen.
+    """Show the replay in MuJoCo's viewer: before the fit on the left, after it on the right. Needs a screen.
 
-    With --port it is a page for a browser instead: the measured motion beside both, a slider, and the residuals of
-    every joint.
+    With --port it serves a page for a browser instead, with the measured motion, a slider, and the residuals of every
+    joint.
     """
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """Folder of `identify` or of `all`. Default: runs/identify where it holds a replay, else runs/all."""
+    """Folder of `identify` or of `all`. Default: runs/identify if it has a replay, otherwise runs/all."""
     speed: float = 1.0
-    """Times real time, in MuJoCo's viewer."""
+    """Speed relative to real time, in MuJoCo's viewer."""
     port: int | None = None
-    """Serve the page for a browser at this port until Ctrl-C; 0 takes a free one."""
+    """Serve the page for a browser at this port until Ctrl-C; 0 takes a free port."""
     host: str = "127.0.0.1"
-    """Address that the page is served at. The default can be reached from this machine alone, or by `ssh -L`."""
+    """Address of the server. The default is reachable only from this machine, or by `ssh -L`."""
 
 
 def run(command: View) -> None:
-    """Play the states of replay.npz over and over until the window is closed, or serve the viewer's page."""
+    """Play replay.npz in a loop until the window is closed, or serve the viewer's page."""
     if command.port is not None and not 0 <= command.port < 65536:
         raise ValueError(f"--port must be a number from 0 to 65535, got {command.port}")
     if not command.speed > 0:
@@ -81,7 +81,7 @@ def run(command: View) -> None:
 
 
 def page_of(folder: Path) -> bytes:
-    """The viewer's page of a fit's folder; drawn first where `identify` could not, or an older version had none."""
+    """The viewer's page of a fit's folder; it is drawn first if it is missing."""
     if not (folder / VIEWER).is_file():
         import mujoco
 
@@ -99,7 +99,7 @@ def page_of(folder: Path) -> bytes:
 def serve(page: bytes, host: str, port: int) -> None:
     """Serve one page at every path until Ctrl-C.
 
-    Raises ValueError where the port cannot be had.
+    Raises ValueError if the port is not available.
     """
 
     class Page(BaseHTTPRequestHandler):
@@ -139,22 +139,21 @@ def replay_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:
-    """A model of two copies of an MJCF, the first on the left; its positions are theirs, one after the other.
+    """A model with two copies of an MJCF, the first on the left; its positions are those of both copies in turn.
 
-    With it [2 nq], to be added to these positions: those of free bodies are the world's, and both would lie in one
-    place.
+    Also an offset [2 nq] to add to these positions, since positions of free bodies are in the world frame.
     """
     import mujoco
     import numpy as np
 
     one = mujoco.MjModel.from_xml_path(str(mjcf))
-    half = 0.5 * APART * float(one.stat.extent)
+    half = 0.5 * DISTANCE * float(one.stat.extent)
     both = mujoco.MjSpec()
     both.option = mujoco.MjSpec.from_file(str(mjcf)).option
     for name, y in (("before", half), ("after", -half)):
         frame = both.worldbody.add_frame(pos=[0.0, y, 0.0])
         both.attach(mujoco.MjSpec.from_file(str(mjcf)), prefix=f"{name}/", frame=frame)
-    with warnings.catch_warnings():  # of settings that only matter where something is simulated
+    with warnings.catch_warnings():  # about settings that matter only in a simulation
         warnings.simplefilter("ignore", UserWarning)
         model = both.compile()
     return model, model.qpos0 - np.tile(one.qpos0, 2)
@@ -164,8 +163,8 @@ def side_by_side(mjcf: Path) -> tuple[mujoco.MjModel, np.ndarray]:
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Any]:
     """MuJoCo's viewer.
 
-    Its own thread takes the window down; a program that ends meanwhile ends in a segmentation fault
-    (google-deepmind/mujoco#1265), so it is waited for.
+    Its thread closes the window.  A program that ends before that has a segmentation fault
+    (google-deepmind/mujoco#1265), so the thread is joined.
     """
     import mujoco.viewer
 
@@ -179,12 +178,12 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[Any]:
 
 
 def _opens() -> bool:
-    """Whether a window can be opened: where none can, MuJoCo's viewer ends the program."""
+    """Whether a window can be opened; if not, MuJoCo's viewer would end the program."""
     if not sys.platform.startswith("linux"):
         return True
     import glfw
 
-    with warnings.catch_warnings():  # glfw says so in a warning
+    with warnings.catch_warnings():  # glfw warns if it cannot
         warnings.simplefilter("ignore")
         opens = bool(glfw.init())
     glfw.terminate()

@@ -1,7 +1,7 @@
-"""Who writes to a results folder: one process at a time, and only where nothing of somebody else's would be replaced.
+"""Lock of a results folder: one process writes at a time, and files of other programs are never replaced.
 
-The lock is the operating system's: a process that is killed leaves none behind.  Its file is there while a run writes;
-`report`, `view` and whatever only reads need no lock.
+The lock is the operating system's, so a killed process releases it.  The lock file exists while a run writes.
+`report`, `view` and other readers need no lock.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class InUse(ValueError):
 def writes(
     stage: str | None, folder: Callable[[Any], Path] = lambda command: command.out, make: bool = True
 ) -> Callable[..., Any]:
-    """Decorator of a command's `run`: it is the one writer of its results folder for as long as it runs.
+    """Decorator of a command's `run` that makes it the only writer of its results folder.
 
     Args:
-        stage: "identify", "gap", "train" or "all", whose names in the folder must be this program's; None: the command
-            looks for itself.
-        folder: of a command; default: its --out.
-        make: the folder where it is missing.
+        stage: "identify", "gap", "train" or "all": files with the names of this stage must be this program's. None: the
+            command checks this itself.
+        folder: function from the command to its folder; default: its --out.
+        make: whether to make a missing folder.
     """
 
     def of(run: Callable[[T], None]) -> Callable[[T], None]:
@@ -53,7 +53,7 @@ def writes(
 
 @contextlib.contextmanager
 def one_writer(folder: Path, stage: str | None) -> Iterator[None]:
-    """Hold a results folder for this process while the block runs; folders that stay empty are removed again.
+    """Lock a results folder while the block runs; new folders that stay empty are removed.
 
     Raises:
         InUse: another process writes there, or to the folder of `all` above it.
@@ -98,7 +98,7 @@ def _locked(folder: Path) -> Iterator[None]:
         raise ValueError(f"the results folder {folder} cannot be written: {reason}") from None
 
     def leave() -> None:
-        # While the lock is held: whoever has opened its file meanwhile sees that it is gone, and makes another.
+        # Removed while the lock is held: a process that has opened the file meanwhile notices, and makes another.
         (here / LOCK).unlink(missing_ok=True)
 
     _HELD.add(here)
@@ -113,12 +113,12 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _in_use(folder: Path) -> str:
-    """Who writes there, as far as the lock's file says."""
+    """Message about the process that writes to a folder."""
     try:
         process = f" (process {int((folder / LOCK).read_text())})"
     except (OSError, ValueError):
         process = ""
-    return f"another run writes to {folder}{process}: wait for its end, or choose another --out"
+    return f"another run writes to {folder}{process}: wait until it ends, or choose another --out"
 
 
 def _is_locked(path: Path) -> bool:
@@ -132,18 +132,18 @@ def _is_locked(path: Path) -> bool:
             return False
     except Timeout:
         return True
-    except (OSError, NotImplementedError):  # of somebody else, and not to be opened: no lock of ours
+    except (OSError, NotImplementedError):  # a file of another owner: not this program's lock
         return False
 
 
 def _make(folder: Path) -> list[Path]:
-    """Make a folder; those that were missing, the deepest first."""
+    """Make a folder; returns the folders that were missing, the deepest first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     return missing
 
 
-# What says that this program ran in a folder: these keys in one of these files.
+# Keys that identify files of this program.
 _SIGNS = {
     SETUP: ("preset", "seed"),
     ASKED: ("preset", "seed", "effect_scale", "files"),
@@ -156,7 +156,7 @@ _SYNTHETIC = re.compile(r"[A-Z](_springs\d_seed\d+(_paper)?)?\.npz")  # recordin
 
 
 def check_own(folder: Path, stage: str) -> None:
-    """ValueError where a folder holds what this program did not write under a name that the stage writes or removes."""
+    """ValueError if a folder has files of other programs with names that the stage writes or removes."""
     if not folder.is_dir() or any(_is_sign(folder / name, keys) for name, keys in _SIGNS.items()):
         return
     strange = [name for name in WRITTEN[stage] if kind_of(folder / name)]
@@ -169,7 +169,7 @@ def check_own(folder: Path, stage: str) -> None:
 
 
 def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
-    """Whether a JSON file holds these keys, or is a setup that is damaged, which the command has its own words for."""
+    """Whether a JSON file has these keys, or is a damaged setup, which the command reports itself."""
     try:
         found = read_json(path)
     except OSError:
@@ -180,7 +180,7 @@ def _is_sign(path: Path, keys: tuple[str, ...]) -> bool:
 
 
 def _strange_recordings(folder: Path) -> list[Path]:
-    """Files of others in a folder of recordings under names of the synthetic robot's."""
+    """Files in a folder of recordings with names of the synthetic robot's that it did not record."""
     if not folder.is_dir() or (folder / SYNTHETIC_ROBOT).is_file():
         return []
     from droid_jax.recordings.formats import load_recording

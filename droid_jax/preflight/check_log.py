@@ -1,9 +1,9 @@
-"""Whether a recording can be what it says: units, signs, order of the joints, weight, clocks and repeats.
+"""Check a recording against a scene: units, signs, order of the joints, gravity, clocks and repeats.
 
-`check_log` compares what is in the recording with what the scene expects at its nominal values.  An alternative is
-named only where the recording as stated explains hardly anything and the alternative nearly everything, so a model
-that is merely wrong raises nothing.  What is found is said, and stands in the results; `refuse_certain` stops a fit
-that could not mean anything.
+`check_log` compares the recording with predictions of the scene at its nominal values.  An alternative is reported
+only if the recording as stated explains hardly any of the signal and the alternative nearly all of it, so a moderately
+wrong model causes no finding.  Findings are printed and written into the results.  `refuse_certain` stops a fit that
+would be meaningless.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.servo_gains import with_stated_gains
 
 _Found = weakref.WeakKeyDictionary[Scene, tuple[Finding, ...]]
-_FOUND: weakref.WeakKeyDictionary[Recording, _Found] = weakref.WeakKeyDictionary()  # so that each is checked once
+_FOUND: weakref.WeakKeyDictionary[Recording, _Found] = weakref.WeakKeyDictionary()  # each is checked once
 
 
 def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
-    """What of a recording can hardly be right in this scene, the gravest first.
+    """Probable errors of a recording in this scene, the most severe first.
 
     Args:
-        scene: with its nominal values: masses right to a factor of three, servo gains as on the robot. Gains that the
-            recording states count in their place, as in its replay.
+        scene: at its nominal values: masses within a factor of three, servo gains as on the robot. Gains that the
+            recording states replace the scene's, as in its replay.
         recording: a valid one (`recordings.checks.validate`).
 
     Returns:
-        The findings; none where all is as it should be, or where too little was measured to tell.
+        The findings; empty if nothing is wrong, or if the measurements are too few for a check.
     """
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
@@ -47,7 +47,7 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
         if motion is not None:
             tracking = check_tracking(scene, recording, motion)
             found += tracking
-            if not tracking:  # else the torque is judged by a motion that is wrong
+            if not tracking:  # otherwise the motion, by which torques are checked, is wrong itself
                 replayed = replace(scene, model=with_stated_gains(scene, recording))
                 wrong = check_torque(replayed, recording, motion) or check_servo_balance(replayed, recording, motion)
                 clocks = any(f.kind == "clock" and f.severity != "note" for f in found)
@@ -57,30 +57,30 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
 
 
 def check_alone(recording: Recording, *, clocks: bool = True) -> list[Finding]:
-    """The same as far as no scene is needed; clocks: whether stamps are compared among each other."""
+    """Findings that need no scene; clocks: whether time stamps are checked too."""
     found = [*check_repeats(recording), *_unused(recording), *check_saturation(recording)]
     return found + (check_stamps(recording) if clocks else [])
 
 
 def _unused(recording: Recording) -> list[Finding]:
-    """Set-points that were in the log and are in no replay."""
+    """Note about set-points in the log that no replay uses."""
     fields = recording.meta.get("unused_setpoints", "")
     if not fields:
         return []
     sentence = (
-        f"recording {recording.name!r}: its commands had set-points of {fields} beside the positions, which no replay "
-        "uses: a servo that follows them lags less than its replay, which looks like damping, a delay or another gain"
+        f"recording {recording.name!r}: its commands also had set-points of {fields}, which no replay uses: a servo "
+        "that uses them lags less than its replay, and a fit explains that by damping, a delay or another gain"
     )
     return [Finding("unused", fields, 1.0, 0.0, "note", sentence)]
 
 
 def refuse_certain(scene: Scene, recordings: Iterable[Recording]) -> None:
-    """Raise ValueError for recordings of which no fit can mean anything: those with a finding that is certain."""
+    """Raise ValueError for recordings with a finding of severity "certain", whose fit would be meaningless."""
     said = [f.sentence for recording in recordings for f in check_log(scene, recording) if f.severity == "certain"]
     if said:
         raise ValueError(
-            f"{'; '.join(dict.fromkeys(said))}: no fit of it means anything; `check` shows everything that was found. "
-            "Mend the recording or the scene, or go on with --force"
+            f"{'; '.join(dict.fromkeys(said))}: a fit would be meaningless; `check` shows all findings. "
+            "Correct the recording or the scene, or go on with --force"
         )
 
 

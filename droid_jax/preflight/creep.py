@@ -1,8 +1,8 @@
-"""How fast a joint that dry friction holds creeps in the simulation, where a real one stands still.
+"""Creep of simulated joints that dry friction holds, where real joints stand still.
 
-MuJoCo's friction loss is a soft constraint.  Below the loss F its force is -(b / R) v, with the damping b of
-`solreffriction` and R = (1 - d) / d times the joint's inverse inertia at qpos0, d being the impedance of
-`solimpfriction`: under a load T < F the joint moves at T R / b for as long as it is held.
+MuJoCo's friction loss is a soft constraint.  Below the loss F its force is -(b / R) v.  Here b is the damping of
+`solreffriction`, R = (1 - d) / d times the joint's inverse inertia at qpos0, and d the impedance of `solimpfriction`.
+Under a load T < F the joint therefore moves at the speed T R / b.
 Source: MuJoCo documentation, "Computation", sections "Friction loss" and "Solver parameters".
 """
 
@@ -18,20 +18,20 @@ from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate.initial_state import sent_columns, start_pose, weight_share
 from droid_jax.simulate.servo_gains import with_stated_gains
 
-STIFF = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction with which joints hold: a thousandth of the default's creep
-HOLDS = 0.5  # s: a joint that stands still for less is turning round
-STILL = 2e-3  # rad or m: a joint that stays within it stands still, whatever its encoder's noise
-VISIBLE = 5e-4  # rad or m: creep by less than this is below what encoders of robots resolve
-BESIDE_NOISE = 3.0  # deviations of the measured position, which creep must exceed to be seen beside it
-BESIDE_TRACKING = 0.1  # of the tracking error (root mean square), likewise
+HOLDING_SOLIMP = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction that reduces the default's creep to a thousandth
+SHORTEST_HOLD = 0.5  # s; shorter rests are reversals of the motion
+STILL_WITHIN = 2e-3  # rad or m: a joint that stays within this span stands still; above encoder noise
+LEAST_CREEP = 5e-4  # rad or m; smaller creep is below the resolution of encoders
+NOISE_FACTOR = 3.0  # creep must exceed so many noise deviations of the measured position
+TRACKING_SHARE = 0.1  # and this share of the tracking error (root mean square)
 
 
 @dataclass(frozen=True)
 class Creep:
-    """A joint that creeps while it is held.
+    """A joint that creeps while friction holds it.
 
-    load: N m or N that friction holds.  speed: rad/s or m/s.  seconds: of the longest hold.  distance: rad or m that
-    it moves in that time.  mended: speed with STIFF.
+    load: N m or N that friction holds.  speed: rad/s or m/s.  seconds: duration of the longest hold.  distance: rad or
+    m that the joint moves in that time.  mended: speed with HOLDING_SOLIMP.
     """
 
     joint: str
@@ -43,7 +43,7 @@ class Creep:
 
 
 def creep_per_load(model: mujoco.MjModel, dof: int, solimp: np.ndarray | None = None) -> float:
-    """rad/s per N m (m/s per N) at which a held degree of freedom creeps; solimp: [5] in place of the model's."""
+    """Creep speed per load of a degree of freedom, rad/s per N m (m/s per N); solimp: [5] in place of the model's."""
     reference, impedance = model.dof_solref[dof], model.dof_solimp[dof] if solimp is None else solimp
     start, end = np.clip(impedance[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     if reference[1] <= 0:  # stated directly
@@ -57,15 +57,19 @@ def creep_per_load(model: mujoco.MjModel, dof: int, solimp: np.ndarray | None = 
 
 
 def creeping(scene: Scene, recording: Recording, model: mujoco.MjModel | None = None) -> list[Creep]:
-    """The joints that creep visibly in a commanded replay, beside position noise and tracking error.
+    """The joints whose creep in a commanded replay exceeds position noise and tracking error.
 
-    What friction holds is what weight, springs and the motor leave: of the measured torque on the motor's side, else of
-    the scene's actuators, in the middle of the longest time for which the joint was measured, or sent, to stand still.
+    The load on friction is weight and springs minus the motor's torque, in the middle of the longest interval in which
+    the joint stands still (measured, or else commanded).  The motor's torque is the measured one if it was measured on
+    the motor's side, otherwise that of the scene's actuators.
 
     Args:
         scene: of the replay.
-        recording: with commands; without any nothing creeps.
-        model: the scene's with other numbers, such as fitted ones.
+        recording: of the replay; without commands the result is empty.
+        model: the scene's model with other numbers, such as fitted ones.
+
+    Returns:
+        One entry for each such joint.
     """
     numbers = scene.model if model is None else model
     if not recording.command.size or numbers.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS:
@@ -77,24 +81,24 @@ def creeping(scene: Scene, recording: Recording, model: mujoco.MjModel | None = 
     for joint in rubbed:
         dof = scene.dof(joint)
         per_load, loss = creep_per_load(numbers, dof), float(numbers.dof_frictionloss[dof])
-        if qpos0 is None or per_load * loss * recording.duration < VISIBLE:
+        if qpos0 is None or per_load * loss * recording.duration < LEAST_CREEP:
             continue
         begin, end = _longest_hold(scene, recording, joint)
-        if end - begin < HOLDS:
+        if end - begin < SHORTEST_HOLD:
             continue
         load = min(loss, abs(_left_to_friction(scene, numbers, recording, joint, qpos0, 0.5 * (begin + end))))
         distance = per_load * load * (end - begin)
         if (stiffness := _stiffness(scene, numbers, joint)) > 0:
-            distance = min(distance, load / stiffness)  # a servo that creeps towards its target stops there
+            distance = min(distance, load / stiffness)  # the servo stops the joint at its target
         if distance > _seen_from(scene, recording, joint):
-            stiff = np.array([float(n) for n in STIFF.split()])
+            stiff = np.array([float(n) for n in HOLDING_SOLIMP.split()])
             mended = creep_per_load(numbers, dof, stiff) * load
             found.append(Creep(joint, load, per_load * load, end - begin, distance, mended))
     return found
 
 
 def creep_note(scene: Scene, recording: Recording, model: mujoco.MjModel | None = None) -> str:
-    """What is to be known of joints that creep, or would where the scene holds them (`Scene.held`); else empty."""
+    """Note about joints that creep, or would creep without the scene's correction (`Scene.held`); empty if none."""
     held = bool(scene.held) and model is None
     found = creeping(scene, recording, as_given(scene) if held else model)
     if not found:
@@ -108,10 +112,10 @@ def creep_note(scene: Scene, recording: Recording, model: mujoco.MjModel | None 
         )
     creep, why = ("would creep", "in its MJCF") if held else ("creep", "in the replay")
     do = (
-        "the replay holds them, as the fitted MJCF will (--joint-friction scene replays them as they are)"
+        "the replay holds them, as the fitted MJCF will (--joint-friction scene keeps the MJCF's constraint)"
         if held
-        else f'give these joints solimpfriction="{STIFF}" in the MJCF, else gains, damping and friction of a fit make '
-        "up for it"
+        else f'give these joints solimpfriction="{HOLDING_SOLIMP}" in the MJCF, otherwise gains, damping and '
+        "friction of a fit are biased"
     )
     return (
         f"joints of scene {scene.name!r} that dry friction holds {creep} {why} with recording {recording.name!r}, "
@@ -120,7 +124,7 @@ def creep_note(scene: Scene, recording: Recording, model: mujoco.MjModel | None 
 
 
 def as_given(scene: Scene) -> mujoco.MjModel:
-    """The scene's model with the friction constraints that its MJCF had."""
+    """The scene's model with the friction constraints of its MJCF."""
     model = scene.model.__copy__()
     for joint in scene.held:
         model.dof_solimp[model.dof_jntid == scene.id("joint", joint)] = SOFT_IMPEDANCE
@@ -128,13 +132,13 @@ def as_given(scene: Scene) -> mujoco.MjModel:
 
 
 def _longest_hold(scene: Scene, recording: Recording, joint: str) -> tuple[float, float]:
-    """s, the longest time for which a joint was measured to stand still, else was commanded the same."""
+    """Start and end, s, of the longest interval in which a joint stands still: measured, or else commanded."""
     channel = recording.channels.get("position")
     if channel is not None and joint in channel.columns:
         i = channel.columns.index(joint)
         seen = channel.mask[..., i].any(axis=0)
         values = np.where(channel.mask[..., i], channel.values[..., i], np.nan)[:, seen]
-        return _still(channel.time[seen], np.nanmean(values, axis=0), max(STILL, 4.0 * _noise(recording, joint)))
+        return _still(channel.time[seen], np.nanmean(values, axis=0), max(STILL_WITHIN, 4.0 * _noise(recording, joint)))
     columns = [c for u, c in sent_columns(scene, recording).items() if scene.command_names[u] == joint]
     if not columns:
         return 0.0, 0.0
@@ -143,9 +147,15 @@ def _longest_hold(scene: Scene, recording: Recording, joint: str) -> tuple[float
 
 
 def _still(time: np.ndarray, path: np.ndarray, within: float) -> tuple[float, float]:
-    """s, the longest stretch of a path [K] that stays within so much: two ends that move along it."""
+    """Start and end, s, of the longest part of a path [K] whose span is at most `within`.
+
+    A sliding window with monotonic queues of its minima and maxima.
+    """
     best, first = (0.0, 0.0), 0
-    lows, highs = list[int](), list[int]()  # rows whose values rise, fall: the ends' smallest and largest come first
+    lows, highs = (
+        list[int](),
+        list[int](),
+    )  # rows of increasing and of decreasing values: the first is the window's minimum, maximum
     for last, value in enumerate(path):
         while lows and path[lows[-1]] >= value:
             lows.pop()
@@ -167,7 +177,7 @@ def _still(time: np.ndarray, path: np.ndarray, within: float) -> tuple[float, fl
 def _left_to_friction(
     scene: Scene, model: mujoco.MjModel, recording: Recording, joint: str, qpos0: np.ndarray, at: float
 ) -> float:
-    """N m or N that is left to a joint's friction at a time, s: weight and springs less the motor's torque."""
+    """Load on a joint's friction at a time in s, N m or N: weight and springs minus the motor's torque."""
     data, dof = mujoco.MjData(model), scene.dof(joint)
     data.qpos[:] = qpos0
     for name, place in zip(scene.single_joints, map(scene.qpos, scene.single_joints), strict=True):
@@ -189,7 +199,7 @@ def _left_to_friction(
 
 
 def _measured_at(recording: Recording, name: str, joint: str, at: float) -> float | None:
-    """What a channel has of a joint about a time, s: the mean over repeats and a tenth of a second; None: nothing."""
+    """Mean of a joint's channel over repeats and a tenth of a second around a time in s; None if not measured."""
     channel = recording.channels.get(name)
     if channel is None or joint not in channel.columns:
         return None
@@ -205,7 +215,7 @@ def _position_servos(scene: Scene, model: mujoco.MjModel) -> set[str]:
 
 
 def _stiffness(scene: Scene, model: mujoco.MjModel, joint: str) -> float:
-    """N m/rad or N/m with which actuators and springs draw a joint back."""
+    """Stiffness of actuators and springs at a joint, N m/rad or N/m."""
     index = scene.id("joint", joint)
     mine = scene.of_joint & (model.actuator_trnid[:, 0] == index)
     servos = -model.actuator_biasprm[mine, 1] * model.actuator_gear[mine, 0] ** 2
@@ -213,10 +223,10 @@ def _stiffness(scene: Scene, model: mujoco.MjModel, joint: str) -> float:
 
 
 def _seen_from(scene: Scene, recording: Recording, joint: str) -> float:
-    """rad or m that a joint must creep to be seen beside its position's noise and its tracking error."""
+    """Smallest creep, rad or m, that exceeds the position's noise and the tracking error of a joint."""
     channel = recording.channels.get("position")
     if channel is None or joint not in channel.columns:
-        return VISIBLE
+        return LEAST_CREEP
     i = channel.columns.index(joint)
     tracking = 0.0
     for actuator, column in sent_columns(scene, recording).items():
@@ -224,11 +234,11 @@ def _seen_from(scene: Scene, recording: Recording, joint: str) -> float:
             sent = np.interp(channel.time, recording.time, recording.command[:, column])
             error = channel.values[..., i] - sent / scene.model.actuator_gear[actuator, 0]
             tracking = float(np.sqrt(np.mean(error[channel.mask[..., i]] ** 2)))
-    return max(VISIBLE, BESIDE_NOISE * _noise(recording, joint), BESIDE_TRACKING * tracking)
+    return max(LEAST_CREEP, NOISE_FACTOR * _noise(recording, joint), TRACKING_SHARE * tracking)
 
 
 def _noise(recording: Recording, joint: str) -> float:
-    """rad or m, deviation of a joint's measured position from row to row."""
+    """Noise deviation of a joint's measured position, rad or m, from its second differences."""
     channel = recording.channels["position"]
     i = channel.columns.index(joint)
     second = np.diff(np.where(channel.mask[..., i], channel.values[..., i], np.nan), n=2, axis=1)

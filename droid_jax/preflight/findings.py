@@ -1,4 +1,4 @@
-"""What a check of a recording finds: `Finding`."""
+"""The result of a check of a recording: `Finding`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Finding:
-    """What of a recording can hardly be right.
+    """A probable error in a recording, or a note about it.
 
-    kind: of the fault.  column: the joint, channel or pair of repeats that it is about.  value: as measured; expected:
-    what it should be near; both in the sentence's terms.  severity: "certain" where no fit of this recording can mean
-    anything, "likely" where something is wrong most often, "note" where nothing is, but has to be known.  sentence:
-    what is wrong, where, and what to do.
+    Attributes:
+        kind: type of the error.
+        column: joint, channel or pair of repeats concerned.
+        value: measured quantity, as in the sentence.
+        expected: value that a correct recording would have.
+        severity: "certain" if a fit of this recording would be meaningless, "likely" if most such recordings are wrong,
+            "note" if nothing is wrong.
+        sentence: the error, its place, and what to do.
     """
 
     kind: Kind

@@ -1,4 +1,4 @@
-"""All that is to be said of a recording before a fit: its findings, with a scene or without, and what it holds."""
+"""All findings about a recording before a fit, with or without a scene, and its content as a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import check_alone, check_log
-from droid_jax.preflight.clocks import GAP
+from droid_jax.preflight.clocks import GAP_STEPS
 from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
 from droid_jax.recordings.recording import Recording
@@ -18,19 +18,19 @@ from droid_jax.simulate.inverse_dynamics import prescribed
 from droid_jax.simulate.measured_motion import CUTOFF, measured_motion
 from droid_jax.simulate.replay import make_drive
 
-ORDER = ("certain", "likely", "note")
+SEVERITIES = ("certain", "likely", "note")
 
 
 def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff: float = CUTOFF) -> tuple[Finding, ...]:
-    """What of a recording can hardly be right, and what has to be known of it, the gravest first.
+    """Probable errors in a recording and notes about it, the most severe first.
 
     Args:
         recording: a valid one.
-        scene: that it is meant for; without one only what is in the recording itself is judged.
-        motion_cutoff: Hz, of the filter of a log's positions (`CompareConfig.motion_cutoff`).
+        scene: the scene that it was recorded for; without it only the recording itself is checked.
+        motion_cutoff: Hz, low-pass of a log's positions (`CompareConfig.motion_cutoff`).
 
     Returns:
-        The findings. Nothing is refused: what a replay would refuse is a finding that is certain.
+        The findings. An error that a replay would raise is a finding of severity "certain".
     """
     if scene is None:
         return _sorted(check_alone(recording))
@@ -46,7 +46,7 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
 
 
 def _replayable(scene: Scene, recording: Recording, motion_cutoff: float) -> None:
-    """Raise ValueError where no replay can follow the recording; that it lacks commands `_notes` says."""
+    """Raise ValueError if the recording cannot be replayed; missing commands are reported by `_notes`."""
     if not recording.command.size:
         measured_motion(recording, prescribed(scene, recording, motion_cutoff), cutoff=motion_cutoff)
     elif set(scene.needs_command) <= set(recording.command_names):
@@ -54,18 +54,18 @@ def _replayable(scene: Scene, recording: Recording, motion_cutoff: float) -> Non
 
 
 def _notes(scene: Scene, recording: Recording) -> list[str]:
-    """Of the commands; none where the recording lacks some that the scene needs, which a replay says."""
+    """Notes about the commands; if the scene needs commands that the recording lacks, only that."""
     missing = [joint for joint in scene.needs_command if joint not in recording.command_names]
     if missing:
         return [
             f"recording {recording.name!r} has no commands for {', '.join(missing)}, and scene {scene.name!r} drives "
-            "them: a replay is refused; check the joints' names"
+            "them: it cannot be replayed; check the joints' names"
         ]
     return command_notes(scene, recording)
 
 
 def _said(kind: Kind, check: Callable[[], None]) -> list[Finding]:
-    """What a check refuses or warns of, as findings."""
+    """Errors and warnings of a check as findings."""
     found = []
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -78,14 +78,14 @@ def _said(kind: Kind, check: Callable[[], None]) -> list[Finding]:
 
 
 def _sorted(found: list[Finding] | tuple[Finding, ...]) -> tuple[Finding, ...]:
-    return tuple(sorted(found, key=lambda finding: ORDER.index(finding.severity)))
+    return tuple(sorted(found, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 @dataclass(frozen=True)
 class Column:
     """One column of a channel, or of the command.
 
-    unit: of its numbers.  low, high: smallest and largest measured value.  measured: share of the samples that are.
+    unit: of its numbers.  low, high: smallest and largest measured value.  measured: share of measured samples.
     """
 
     name: str
@@ -99,8 +99,8 @@ class Column:
 class Signal:
     """The command, or a channel, over time.
 
-    rows: samples of a repeat.  rate: Hz, usual.  jitter: largest deviation of a step from the usual one, as a share of
-    it.  longest: s, of the steps.  gaps: steps longer than GAP usual ones.  columns: of it.
+    rows: samples of a repeat.  rate: Hz, of the median step.  jitter: largest deviation from the median step, relative
+    to it.  longest: s, longest step.  gaps: number of steps longer than GAP_STEPS median steps.  columns: its columns.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Signal:
 
 
 def contents(recording: Recording) -> tuple[Signal, ...]:
-    """The command, where there is one, and the channels of a valid recording."""
+    """The command, if there is one, and the channels of a valid recording."""
     tracks = []
     if recording.command.size:
         values = recording.command[None]
@@ -139,5 +139,5 @@ def _track(
     usual = float(np.median(steps))
     jitter = float(np.abs(steps - usual).max() / usual)
     return Signal(
-        name, len(time), 1.0 / usual, jitter, float(steps.max()), int(np.sum(steps > GAP * usual)), tuple(columns)
+        name, len(time), 1.0 / usual, jitter, float(steps.max()), int(np.sum(steps > GAP_STEPS * usual)), tuple(columns)
     )

@@ -1,5 +1,5 @@
-"""What is to be known of a recording before it is replayed: what its commands are taken for, whether they or the
-measured torques lie beyond limits, whether it begins at rest, and whether its joints can be where it has them."""
+"""Notes about a recording before a replay: interpretation of its commands, limits of commands and torques, a start in
+motion, and positions outside the joints' ranges."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from droid_jax.simulate.closed_loops import OPEN, open_loops
 from droid_jax.simulate.initial_state import sent_columns, sent_to, stated_start
 from droid_jax.simulate.servo_gains import gains_note
 
-BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
-MOVING = 0.25  # of the motion's largest speed: a joint that is faster at the start does not begin at rest
-AT_ONCE = 0.5  # of the speed at the start, that the first two steps must have
-BEYOND = 0.05  # of its range, by which a joint may be outside of it unremarked
-PERCENT = 100.0  # what drivers of small servos normalise a joint's travel to
-TURNS = 4  # from its zero, that a hinge without a range is believed to make; degrees look like that from 25 on
+START_SECONDS = 0.02  # s (six rows at least) over which the speed at the start is estimated
+MOVING_SHARE = 0.25  # of the motion's largest speed: a joint that is faster at the start is not at rest
+FIRST_STEPS_SHARE = 0.5  # of the speed at the start, which the first two steps must reach
+RANGE_SLACK = 0.05  # of its range: a position outside by less causes no warning
+PERCENT = 100.0  # end of the travel that drivers of small servos normalise to
+MOST_TURNS = 4  # turns from zero of a hinge without a range; angles in degrees exceed it from 25 degrees on
 
 
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
-    """What is to be known of the commands: a <motor> that takes radians for torques, geared servos, actuators that got
-    none, other gains than the scene's, loops that are closed first, commands and torques beyond limits, joints that
-    creep while friction holds them.
+    """Notes about the commands of a recording in a scene.
+
+    They concern actuators without position feedback, servos with a gear, actuators without commands, gains that differ
+    from the scene's, open loops, commands and torques beyond limits, and joints that creep.
     """
     said = (
         open_loop(scene, recording),
@@ -43,13 +44,13 @@ def command_notes(scene: Scene, recording: Recording) -> list[str]:
 
 
 def warn_of_commands(scene: Scene, recording: Recording) -> None:
-    """Warn of what is to be known of the commands."""
+    """Issue `command_notes` as warnings."""
     for text in command_notes(scene, recording):
         warnings.warn(text, stacklevel=2)
 
 
 def open_loop(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording's commands drive actuators without position feedback; else empty."""
+    """Note about commands of actuators without position feedback; empty if there are none."""
     open_ones = np.flatnonzero(~has_feedback(scene.model) & scene.of_joint)
     joints = [scene.command_names[u] for u in open_ones if scene.command_names[u] in recording.command_names]
     if not joints or not recording.command.size:
@@ -62,7 +63,7 @@ def open_loop(scene: Scene, recording: Recording) -> str:
 
 
 def geared(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording's commands go to position servos with a gear; else empty."""
+    """Note about commands of position servos with a gear; empty if there are none."""
     gear = scene.model.actuator_gear[:, 0]
     servos = np.flatnonzero(has_feedback(scene.model) & scene.of_joint & (gear != 1.0))
     joints = [scene.command_names[u] for u in servos if scene.command_names[u] in recording.command_names]
@@ -75,7 +76,7 @@ def geared(scene: Scene, recording: Recording) -> str:
 
 
 def left_alone(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording has commands, but none for some actuators; else empty."""
+    """Note about actuators without commands in a commanded recording; empty if there are none."""
     if not recording.command.size:
         return ""
     left = [
@@ -87,12 +88,12 @@ def left_alone(scene: Scene, recording: Recording) -> str:
         "held where the motion starts": [n for n, feedback in left if feedback],
         "given 0 (no position feedback)": [n for n, feedback in left if not feedback],
     }
-    told = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
-    return f"recording {recording.name!r} has not all commands: {told}" if told else ""
+    held = "; ".join(f"{', '.join(names)} {what}" for what, names in said.items() if names)
+    return f"recording {recording.name!r} has not all commands: {held}" if held else ""
 
 
 def closed_loop(scene: Scene, recording: Recording) -> str:
-    """What is to be known where the recording starts with a closed loop open, which other joints then close."""
+    """Note about a kinematic loop that is open at the recorded start and is closed by other joints; empty if none."""
     if not recording.command.size or not scene.model.neq:
         return ""
     wide = [loop for loop in open_loops(scene, stated_start(scene, recording)) if loop.turn > OPEN]
@@ -100,15 +101,15 @@ def closed_loop(scene: Scene, recording: Recording) -> str:
         return ""
     return (
         f"recording {recording.name!r} starts where {wide[0].name} would be open by {wide[0].gap:.3g} (m or rad): the "
-        "joints of that loop that nobody commands or measures start where they close it"
+        "joints of that loop that are neither commanded nor measured start where they close it"
     )
 
 
 def warn_if_moving(recording: Recording) -> None:
-    """Warn where joints were measured to move already when a recording with commands begins: its replay is at rest.
+    """Warn of joints that already move at the start of a commanded recording, since a replay begins at rest.
 
-    The speed at the start is that of a line through the mean of the repeats over so short a time that a servo that sets
-    off from rest is not fast yet; it must be five times its own error.
+    The speed is the slope of a line through the mean of the repeats over the first START_SECONDS, too short for a servo
+    at rest to gain speed.  It must exceed five times its own error.
     """
     channel = recording.channels.get("position")
     if channel is None:
@@ -123,28 +124,31 @@ def warn_if_moving(recording: Recording) -> None:
 
 
 def _moves(begin: float, channel: Channel, column: int) -> bool:
-    """Whether a position's path has a speed of its own where the motion begins."""
+    """Whether a position already changes at the start of the motion."""
     time, seen = channel.time - begin, channel.mask[..., column].all(axis=0)
     path = channel.values[..., column].mean(axis=0)
     rows = np.flatnonzero(seen & (time >= 0.0))
-    first = rows[: max(6, int(np.sum(time[rows] <= BEGINNING)))]
+    first = rows[: max(6, int(np.sum(time[rows] <= START_SECONDS)))]
     if len(first) < 6:  # a line through two points has no error to be judged by
         return False
     (speed, _), covariance = np.polyfit(time[first], path[first], 1, cov=True)
-    # In a slow log a servo that sets off from rest is fast within six rows; its first two steps are slower.
+    # In a slow log a servo that starts at rest is fast within six rows, but its first two steps are slower.
     begins = (path[first[2]] - path[first[0]]) / (time[first[2]] - time[first[0]])
-    if begins * np.sign(speed) < AT_ONCE * abs(speed):
+    if begins * np.sign(speed) < FIRST_STEPS_SHARE * abs(speed):
         return False
     steps = rows[:: len(first)]  # as far apart as the beginning is long
     fastest = np.abs(np.diff(path[steps]) / np.diff(time[steps])).max(initial=0.0)
-    return bool(abs(speed) > max(MOVING * fastest, 5.0 * np.sqrt(covariance[0, 0])))
+    return bool(abs(speed) > max(MOVING_SHARE * fastest, 5.0 * np.sqrt(covariance[0, 0])))
 
 
 def check_range(scene: Scene, recording: Recording) -> None:
-    """Raise ValueError where a measured joint goes, or is sent, so far outside its range that the unit is wrong.
+    """Check measured and commanded positions against the joints' ranges.
 
-    One that is outside by more than BEYOND of its range is warned of, and a hinge without a range, which may be a
-    wheel, where it goes more than TURNS from its zero.
+    Warns of positions outside the range by more than RANGE_SLACK of it, and of a hinge without a range (which may be a
+    wheel) that is more than MOST_TURNS from zero.
+
+    Raises:
+        ValueError: a position is so far outside that its unit must be wrong.
     """
     sent = sent_to(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
@@ -160,11 +164,11 @@ def check_range(scene: Scene, recording: Recording) -> None:
 
 
 def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None:
-    """As `check_range`, of one joint's path [K], NaN where it was not seen; begin: of what is said."""
+    """`check_range` for one joint's path [K], NaN where not measured; begin: first words of the message."""
     index = scene.id("joint", joint)
     slide = scene.slides(joint)
     low, high = scene.model.jnt_range[index]
-    if low < high:  # whether the replay holds it there or not
+    if low < high:  # whether or not the replay enforces the range
         beyond = np.maximum(low - path, path - high)
         worst = int(np.nanargmax(beyond))
         unit = (
@@ -174,18 +178,18 @@ def _check_reach(scene: Scene, joint: str, path: np.ndarray, begin: str) -> None
         )
         if beyond[worst] > high - low:
             raise ValueError(f"{begin} {path[worst]:.4g}, far outside its range {low:.4g} .. {high:.4g} {unit}")
-        if beyond[worst] > BEYOND * (high - low):
+        if beyond[worst] > RANGE_SLACK * (high - low):
             warnings.warn(f"{begin} {path[worst]:.4g}, outside its range {low:.4g} .. {high:.4g} {unit}", stacklevel=3)
     elif not slide:
         turns = np.abs(path) / (2 * np.pi)
         worst = int(np.nanargmax(turns))
-        if turns[worst] > TURNS:
+        if turns[worst] > MOST_TURNS:
             units = f"are these degrees?{_other_units(path)}"
             warnings.warn(f"{begin} {path[worst]:.4g} rad, {turns[worst]:.3g} turns: {units}", stacklevel=3)
 
 
 def _other_units(path: np.ndarray) -> str:
-    """What else than degrees or millimetres a path [K] may be in, as a question."""
+    """Question about other possible units of a path [K] than degrees or millimetres; empty if there are none."""
     seen = path[~np.isnan(path)]
     counts = len(seen) > 1 and np.ptp(seen) > 1 and bool(np.all(seen == np.round(seen)))
     if counts and np.abs(seen).max() > PERCENT:
@@ -193,13 +197,13 @@ def _other_units(path: np.ndarray) -> str:
     return " Or normalised to -100 .. 100, or 0 .. 100?" if np.abs(seen).max() <= PERCENT else ""
 
 
-ROUNDING = 1e-6  # of a range, by which a command may miss it
-SLACK = 0.05  # of a torque limit: noise on top of a torque at its limit is none beyond it
-RARE = 0.001  # share of the samples: torques beyond a limit more rarely are outliers
+COMMAND_SLACK = 1e-6  # of ctrlrange: rounding of commands
+TORQUE_SLACK = 0.05  # of a torque limit: noise of a torque at its limit
+OUTLIER_SHARE = 0.001  # of the samples: fewer torques beyond a limit are outliers
 
 
 def clipped_commands(scene: Scene, recording: Recording) -> str:
-    """What is to be known where commands lie beyond their actuators' ctrlrange; else empty."""
+    """Note about commands beyond their actuators' ctrlrange; empty if there are none."""
     model = scene.model
     if not recording.command.size or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         return ""
@@ -208,7 +212,7 @@ def clipped_commands(scene: Scene, recording: Recording) -> str:
         if not model.actuator_ctrllimited[actuator]:
             continue
         low, high = model.actuator_ctrlrange[actuator]
-        sent, slack = recording.command[:, column], ROUNDING * (high - low)
+        sent, slack = recording.command[:, column], COMMAND_SLACK * (high - low)
         share = float(np.mean((sent < low - slack) | (sent > high + slack)))
         if share:
             name = scene.command_names[actuator]
@@ -225,7 +229,7 @@ def clipped_commands(scene: Scene, recording: Recording) -> str:
 
 
 def exceeded_torques(scene: Scene, recording: Recording) -> str:
-    """What is to be known where measured torques are larger than the scene's actuators can be; else empty."""
+    """Note about measured torques beyond the limits of the scene's actuators; empty if there are none."""
     channel = recording.channels.get("torque")
     if channel is None or not recording.command.size:
         return ""
@@ -236,9 +240,11 @@ def exceeded_torques(scene: Scene, recording: Recording) -> str:
         low, high = torque_range(scene, joint)
         seen = channel.values[..., i][channel.mask[..., i]]
         share = (
-            float(np.mean((seen < low - SLACK * abs(low)) | (seen > high + SLACK * abs(high)))) if seen.size else 0.0
+            float(np.mean((seen < low - TORQUE_SLACK * abs(low)) | (seen > high + TORQUE_SLACK * abs(high))))
+            if seen.size
+            else 0.0
         )
-        if share > RARE:
+        if share > OUTLIER_SHARE:
             said.append(
                 f"{joint} in {_percent(share)} of the samples (up to {np.abs(seen).max():.3g} {channel.unit}, limits "
                 f"{low:.3g} .. {high:.3g})"
@@ -253,9 +259,9 @@ def exceeded_torques(scene: Scene, recording: Recording) -> str:
 
 
 def torque_range(scene: Scene, joint: str) -> tuple[float, float]:
-    """Smallest and largest torque (N m, N of slides) that the scene's actuators can have at a joint of one degree.
+    """Smallest and largest torque of the scene's actuators at a hinge (N m) or slide (N).
 
-    Infinite where one of them is not limited, or where one drives a tendon, a site or a body, whose lever is not known.
+    Infinite if one of them has no limit, or drives a tendon, a site or a body, whose lever arm is unknown.
     """
     model, index = scene.model, scene.id("joint", joint)
     low = high = 0.0

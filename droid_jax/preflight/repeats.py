@@ -1,4 +1,4 @@
-"""Repeats that are copies, columns that a sensor did not measure, and recordings in which nothing moves."""
+"""Check for copied repeats, constant or rounded columns, and recordings without motion."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ from droid_jax.preflight.findings import Finding
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.repeat_starts import spread
 
-COPY = 1e-6  # of a channel's size: repeats that differ by less were measured once (float32 rounds by less)
-LEVELS = 8  # a column that moves and takes no more different values is coarse
-RESTS = {"position": 0.02, "velocity": 0.1, "torque": 0.2}  # rad, rad/s, N m: a column that changes by less may rest
-SENT = 1e-4  # of a command's own unit: one that changes by less is constant
-STANDS = {"rad": 5e-3, "m": 5e-4}  # a column that was measured to move by less rests, but for its encoder's steps
-SHORT = 40  # rows below which a recording is not called motionless
-STRAYS = 0.01  # share of the samples at both ends that may be outliers
-NAMED = 3  # pairs of copies that are named
+COPY_TOLERANCE = 1e-6  # of a channel's largest value: repeats that differ by less are copies (float32 rounds by less)
+COARSE_VALUES = 8  # a column that moves and has at most so many different values is coarse
+RESTING_SPAN = {
+    "position": 0.02,
+    "velocity": 0.1,
+    "torque": 0.2,
+}  # rad, rad/s, N m: a column that changes by less may be at rest
+CONSTANT_COMMAND = 1e-4  # in the command's unit: a command that changes by less is constant
+MOTIONLESS_SPAN = {
+    "rad": 5e-3,
+    "m": 5e-4,
+}  # a position that changes by less is at rest; larger than encoder steps
+FEWEST_ROWS = 40  # shorter recordings are not reported as motionless
+OUTLIER_SHARE = 0.01  # share of the samples at both extremes that is ignored
+NAMED_PAIRS = 3  # most pairs of copies that a sentence lists
 
 
 def check_repeats(recording: Recording) -> list[Finding]:
-    """What is wrong with the repeats and the sensors."""
+    """Findings about repeats and sensors."""
     where = f"recording {recording.name!r}"
     sensors = [finding for channel in recording.channels.values() for finding in _sensors(channel, where)]
     found = _copies(recording, where) + sensors + _dead(recording, where) + _apart(recording, where)
@@ -29,33 +36,35 @@ def check_repeats(recording: Recording) -> list[Finding]:
 
 
 def _motionless(recording: Recording, where: str) -> list[Finding]:
-    """A recording in which no command changes and no joint moves."""
+    """Finding for a recording in which no command changes and no joint moves."""
     rows = max(len(recording.time), *(len(c.time) for c in recording.channels.values()))
-    if rows < SHORT or (recording.command.size and np.ptp(recording.command, axis=0).max() > SENT):
+    if rows < FEWEST_ROWS or (recording.command.size and np.ptp(recording.command, axis=0).max() > CONSTANT_COMMAND):
         return []
     most = 0.0
     for channel in (recording.channels[key] for key in ("position", "object_angle") if key in recording.channels):
         for c in range(len(channel.columns)):
             values = channel.values[..., c][channel.mask[..., c]]
-            low, high = np.quantile(values, [STRAYS, 1 - STRAYS]) if values.size else (0.0, 0.0)
-            if high - low > min(STANDS.get(unit, 0.0) for unit in channel.unit.split(" or ")):
+            low, high = np.quantile(values, [OUTLIER_SHARE, 1 - OUTLIER_SHARE]) if values.size else (0.0, 0.0)
+            if high - low > min(MOTIONLESS_SPAN.get(unit, 0.0) for unit in channel.unit.split(" or ")):
                 return []
             most = max(most, float(high - low))
     if not recording.command.size and not {"position", "object_angle"} & {*recording.channels}:
         return []
-    sentence = f"{where}: nothing moves in it (by {most:.2g} at most): record a motion, which tells the parameters"
-    return [Finding("motion", "", most, STANDS["rad"], "certain", sentence)]
+    sentence = (
+        f"{where}: nothing moves in it (by {most:.2g} at most): record a motion, so that parameters are identifiable"
+    )
+    return [Finding("motion", "", most, MOTIONLESS_SPAN["rad"], "certain", sentence)]
 
 
 def _dead(recording: Recording, where: str) -> list[Finding]:
-    """Columns that hold one number throughout while another channel of the same joint moves.
+    """Findings for constant columns of joints whose other channels change.
 
-    Positions beside commands are judged by how far they were sent (`tracking`).
+    Positions of commanded joints are checked in `tracking`.
     """
     moving = {
-        key: {j for c, j in enumerate(channel.columns) if _span(channel, c) > RESTS[key]}
+        key: {j for c, j in enumerate(channel.columns) if _span(channel, c) > RESTING_SPAN[key]}
         for key, channel in recording.channels.items()
-        if key in RESTS
+        if key in RESTING_SPAN
     }
     others = {"position": ("velocity", "torque"), "velocity": ("position",), "torque": ("position", "velocity")}
     found = []
@@ -70,7 +79,7 @@ def _dead(recording: Recording, where: str) -> list[Finding]:
                     Finding(
                         "sensor", joint, 0.0, 0.0, "likely" if by != "torque" else "note",
                         f"{where}: the {key} of {joint} does not move, it is {value:g} throughout while its {by} "
-                        "changes: is the column dead, or not measured?",
+                        "changes: is the sensor broken, or the column not measured?",
                     )
                 )  # fmt: skip
     return found
@@ -83,7 +92,7 @@ def _span(channel: Channel, column: int) -> float:
 
 
 def _apart(recording: Recording, where: str) -> list[Finding]:
-    """How far apart the repeats start, where that is visible."""
+    """Note about repeats that start at visibly different positions."""
     apart = spread(recording)
     if not apart:
         return []
@@ -105,15 +114,17 @@ def _copies(recording: Recording, where: str) -> list[Finding]:
                 pairs.setdefault(pair, []).append(key)
     if not pairs:
         return []
-    named = ", ".join(f"{i} and {j}" for i, j in list(pairs)[:NAMED]) + (", ..." if len(pairs) > NAMED else "")
+    named = ", ".join(f"{i} and {j}" for i, j in list(pairs)[:NAMED_PAIRS]) + (
+        ", ..." if len(pairs) > NAMED_PAIRS else ""
+    )
     whole = all(len(keys) == len(recording.channels) for keys in pairs.values())
     what = "" if whole else f" in channel {', '.join(sorted({k for keys in pairs.values() for k in keys}))}"
     first = next(iter(pairs))
     return [
         Finding(
             "repeats", f"{first[0]} and {first[1]}", float(len(pairs)), 0.0, "likely",
-            f"{where}: repeats {named} are identical{what}: are they copies of one? Copies do not tell how noisy the "
-            "measurement is, and intervals, noise floor and p-values mean nothing then; give each measurement once",
+            f"{where}: repeats {named} are identical{what}: are they copies of one? Noise cannot be estimated from "
+            "copies, so intervals, noise floor and p-values would be meaningless; give each measurement once",
         )
     ]  # fmt: skip
 
@@ -125,21 +136,21 @@ def _same(channel: Channel, first: int, second: int) -> bool:
         return False
     a, b = channel.values[first][one], channel.values[second][one]
     size = float(np.abs(a).max(initial=0.0))
-    return size > 0 and np.ptp(a) > 0 and bool(np.abs(a - b).max() <= COPY * size)
+    return size > 0 and np.ptp(a) > 0 and bool(np.abs(a - b).max() <= COPY_TOLERANCE * size)
 
 
 def _sensors(channel: Channel, where: str) -> list[Finding]:
-    """Columns that change, in steps as large as the motion."""
+    """Findings for columns that change in steps as large as the motion."""
     found = []
     for c, column in enumerate(channel.columns):
         values = channel.values[:, :, c][channel.mask[:, :, c]]
         levels = np.unique(values[:: max(1, len(values) // 20000)])
-        moves = channel.name in RESTS and len(levels) > 1 and np.ptp(levels) > RESTS[channel.name]
-        if moves and len(levels) <= LEVELS and len(values) > 10 * LEVELS:
+        moves = channel.name in RESTING_SPAN and len(levels) > 1 and np.ptp(levels) > RESTING_SPAN[channel.name]
+        if moves and len(levels) <= COARSE_VALUES and len(values) > 10 * COARSE_VALUES:
             found.append(
                 Finding(
-                    "sensor", column, float(len(levels)), float(LEVELS), "likely",
-                    f"{where}: channel {channel.name!r}, column {column!r} takes {len(levels)} different values only, "
+                    "sensor", column, float(len(levels)), float(COARSE_VALUES), "likely",
+                    f"{where}: channel {channel.name!r}, column {column!r} has only {len(levels)} different values, "
                     f"{np.diff(levels).min():.3g} {channel.unit} apart: is it rounded?",
                 )
             )  # fmt: skip

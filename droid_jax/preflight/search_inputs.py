@@ -1,4 +1,4 @@
-"""What recordings must fulfil before an effect is searched in them: said before anything long begins."""
+"""Requirements on recordings of a search for missing effects, checked before the first fit."""
 
 from __future__ import annotations
 
@@ -12,19 +12,27 @@ from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import JOINT_CHANNELS, Channel, Recording
 from droid_jax.recordings.split import Split, roles_of, split_of
 
-STILL = 0.01  # rad or m: a robot whose joints all move less stood still
-BACKWARDS = 0.25  # share of the way down that a hinge may also go up and still open downwards
-SHUT = 0.05  # rad or m: the same for the thing that is moved, whose camera is noisy
-MISSED = 0.5  # of the usual travel: a repeat that moves the object by less has missed its grasp
-APART = 0.05  # s: repeats that are further apart in time were not cut alike
+LEAST_TRAVEL = 0.01  # rad or m: at least one joint must move more
+OPPOSITE_SHARE = 0.25  # a hinge opens towards negative angles if its positive travel is below this share of it
+LEAST_OBJECT_TRAVEL = 0.05  # rad or m, smallest travel of the object; larger since cameras are noisy
+MISSED_SHARE = 0.5  # of the median travel: a repeat that moves the object less has missed its grasp
+LARGEST_SHIFT = 0.05  # s, largest shift in time of a repeat against the others
 
 
 def assigned_roles(
     scene: Scene, recordings: Sequence[Recording], judges: Sequence[Recording] = ()
 ) -> tuple[Split, dict[str, Recording]]:
-    """How recordings share the work, and each by its role; ValueError where a search in them could not end well.
+    """How the recordings are split into training, validation and test data, and role -> recording.
 
-    judges: test data of commanded logs with few repeats.  Warns of what in them can hardly be right (`check_log`).
+    Warns of the findings of `check_log`.
+
+    Args:
+        scene: the robot.
+        recordings: train, validation and perhaps test; or one; or logs.
+        judges: test recordings of commanded logs with few repeats.
+
+    Raises:
+        ValueError: the recordings do not meet the requirements of a search.
     """
     everything = [*recordings, *judges]
     for recording in everything:
@@ -38,10 +46,10 @@ def assigned_roles(
 
 
 def check_recordings(scene: Scene, roles: Mapping[str, Recording]) -> None:
-    """ValueError where a search in these recordings ("train", "validation", perhaps "test") could not end well.
+    """Raise ValueError unless the recordings ("train", "validation", perhaps "test") suit a search.
 
-    Each must hold repeats, cut alike, of a motion that moves the robot and the object; all must measure the same
-    joints, and none may be another one once more.  How many repeats are enough: `droid_jax.recordings.split`.
+    Each must have repeats, cut at the same point of the motion, that move the robot and the object.  All must measure
+    the same joints, and no two may be equal.  The number of repeats is checked by `droid_jax.recordings.split`.
     """
     for role, recording in roles.items():
         where = f"the {role} recording {recording.name!r}"
@@ -59,10 +67,10 @@ def _check_moves(recording: Recording, where: str) -> None:
         ranges = dict(zip(channel.columns, np.ptp(_mean(channel), axis=0), strict=True))
     elif recording.command.size:
         ranges = dict(zip(recording.command_names, np.ptp(recording.command, axis=0), strict=True))
-    if ranges and max(ranges.values()) < STILL:
+    if ranges and max(ranges.values()) < LEAST_TRAVEL:
         joint = max(ranges, key=lambda name: ranges[name])
         raise ValueError(
-            f"{where} never moves: {joint}, which moves most, does by {ranges[joint]:.2g}; record a motion that "
+            f"{where} never moves: {joint}, which moves most, moves by {ranges[joint]:.2g}; record a motion that "
             "moves the joints and the object"
         )
 
@@ -74,12 +82,12 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
     low, high = _ends(path)
     _check_direction(scene, float(np.nanmedian(low)), float(np.nanmedian(high)), where)
     usual, least = float(np.nanmedian(high - low)), int(np.nanargmin(high - low))
-    if usual < SHUT:
+    if usual < LEAST_OBJECT_TRAVEL:
         raise ValueError(
-            f"{where}: the object joint {scene.object_joint!r} moves by {usual:.2g} only (at least {SHUT:g} is "
-            "needed), so nothing about it can be told; record a motion that opens it"
+            f"{where}: the object joint {scene.object_joint!r} moves by {usual:.2g} only (at least "
+            f"{LEAST_OBJECT_TRAVEL:g} is needed), so its parameters are not identifiable; record a motion that opens it"
         )
-    if (high - low)[least] < MISSED * usual:
+    if (high - low)[least] < MISSED_SHARE * usual:
         raise ValueError(
             f"{where}: in repeat {least} the object joint {scene.object_joint!r} moves by {(high - low)[least]:.2g}, "
             f"in most repeats by {usual:.2g}; leave that repeat away if the grasp was missed"
@@ -87,17 +95,21 @@ def _check_object(scene: Scene, recording: Recording, where: str) -> None:
 
 
 def _check_direction(scene: Scene, low: float, high: float, where: str) -> None:
-    """A latch, a closer, a spring that peaks: all are written for a hinge that is closed at 0 and opens upwards."""
-    if not scene.slides(str(scene.object_joint)) and -low > SHUT and max(high, 0.0) < BACKWARDS * -low:
+    """ValueError for a hinge that opens towards negative angles: the library's laws assume positive ones."""
+    if (
+        not scene.slides(str(scene.object_joint))
+        and -low > LEAST_OBJECT_TRAVEL
+        and max(high, 0.0) < OPPOSITE_SHARE * -low
+    ):
         raise ValueError(
             f"{where}: the object joint {scene.object_joint!r} opens towards negative angles (to {low:.2g} rad), and "
-            "the library's effects of a hinge count from 0 towards positive ones: turn the joint's axis and range "
-            "round in the MJCF, and the sign of what was measured"
+            "the library's effects of a hinge assume that it opens from 0 towards positive ones: turn the joint's axis "
+            "and range round in the MJCF, and change the sign of the measurements"
         )
 
 
 def _object_path(recording: Recording, joint: str) -> np.ndarray | None:
-    """[N, T] where the object's joint is, rad or m, NaN where it was not measured; None where no repeat did."""
+    """Position of the object's joint [N, T], rad or m, NaN where not measured; None if it never was."""
     name = "object_angle" if "object_angle" in recording.channels else "position"
     if name not in recording.channels:
         return None
@@ -110,7 +122,7 @@ def _object_path(recording: Recording, joint: str) -> np.ndarray | None:
 
 
 def _ends(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest [N] of each repeat but for strays; NaN for one that measured nothing: no missed grasp."""
+    """1 % and 99 % quantiles [N] of each repeat; NaN for a repeat without measurements."""
     low, high = np.full(len(path), np.nan), np.full(len(path), np.nan)
     known = ~np.isnan(path).all(axis=1)
     low[known], high[known] = np.nanquantile(path[known], [0.01, 0.99], axis=1)
@@ -121,15 +133,15 @@ def _check_timing(recording: Recording, where: str) -> None:
     name = next((n for n in ("position", *JOINT_CHANNELS) if n in recording.channels), None)
     late = np.zeros(1) if name is None else lags(recording.channel(name))
     worst = int(np.argmax(np.abs(late)))
-    if abs(late[worst]) > APART:
+    if abs(late[worst]) > LARGEST_SHIFT:
         raise ValueError(
             f"{where}: repeat {worst} runs {abs(late[worst]):.2g} s {'behind' if late[worst] > 0 else 'ahead of'} the "
-            f"others (at most {APART:g} s); cut the repeats so that each begins with the motion"
+            f"others (at most {LARGEST_SHIFT:g} s); cut the repeats so that each begins with the motion"
         )
 
 
 def lags(channel: Channel) -> np.ndarray:
-    """[N] s by which each repeat lags the repeats' median, to first order in the lag."""
+    """Lag of each repeat behind the median of the repeats, [N] s, to first order."""
     time, values = _measured(channel)
     usual = np.nanmedian(values, axis=0)
     slope = np.gradient(usual, time, axis=0)
@@ -144,20 +156,20 @@ def _check_different(roles: Mapping[str, Recording]) -> None:
         if first != role:
             raise ValueError(
                 f"the {first} and the {role} recording are the same ({recording.name!r}): an effect must be confirmed "
-                "on a recording that it was not fitted to, of another motion"
+                "on a recording of another motion, to which it was not fitted"
             )
     names: dict[str, str] = {}
     for role, recording in roles.items():
         if (first := names.setdefault(recording.name, role)) != role:
             raise ValueError(
-                f"the {first} and the {role} recording have one name, {recording.name!r}: rename a file, since answers "
-                "name recordings"
+                f"the {first} and the {role} recording have one name, {recording.name!r}: rename a file, since results "
+                "refer to recordings by name"
             )
 
 
 def _check_same_joints(roles: Mapping[str, Recording]) -> None:
     name = next((n for n in JOINT_CHANNELS if all(n in r.channels for r in roles.values())), None)
-    if name is None:  # what compares them says so
+    if name is None:  # reported when channels are compared
         return
     joints = {role: recording.channel(name).columns for role, recording in roles.items()}
     first, *others = joints
@@ -175,7 +187,7 @@ def _mean(channel: Channel) -> np.ndarray:
 
 
 def _measured(channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    """[K] s and values [N, K, C], NaN where masked, at the instants at which some repeat measured each column."""
+    """Times [K] s and values [N, K, C], NaN where masked, at which every column was measured in some repeat."""
     seen = np.all(np.any(channel.mask, axis=0), axis=1)
     if seen.sum() < 2:
         raise ValueError(

@@ -1,6 +1,6 @@
-"""The signals of a recording on one clock, and the torques that the scene's nominal values expect of them.
+"""The signals of a recording on one clock, and the torques that the scene's nominal values predict for them.
 
-What `log_checks` judges a recording by.  Everything runs in plain C MuJoCo and numpy, in a fraction of a second.
+The checks of `check_log` use them.  Everything runs in plain C MuJoCo and numpy, in a fraction of a second.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueSide
 from droid_jax.simulate.initial_state import holding, sent_to, weight_share
 
-CUTOFF = 5.0  # Hz, of all signals: robots' joints move below it, and positions are differentiated twice
-RATE = 100.0  # Hz, of the common clock at most
-FEWEST = 40  # rows of the common clock, below which nothing is judged
-ROWS = 1500  # of the motion at which inverse dynamics is computed, at most
-EDGE = 0.1  # s left out at both ends of a motion, where derivatives are those of the filter
-SECONDS = 20.0  # of the commands that are simulated where no position was measured
-MEASURED = 0.5  # share of a column's rows that must have been measured
+CUTOFF = 5.0  # Hz, low-pass of all signals: joints of robots move below it, and positions are differentiated twice
+RATE = 100.0  # Hz, highest rate of the common clock
+FEWEST_ROWS = 40  # rows of the common clock below which a signal is not checked
+MOST_ROWS = 1500  # most rows of a motion at which inverse dynamics is computed
+EDGE_SECONDS = 0.1  # s left out at both ends of a motion, where the filter distorts derivatives
+SIMULATED_SECONDS = 20.0  # s of the commands that are simulated if no position was measured
+LEAST_MEASURED = 0.5  # share of a column's rows that must be measured
 
 Traces = Mapping[str, np.ndarray]  # joint -> [K]
 
@@ -32,15 +32,15 @@ Traces = Mapping[str, np.ndarray]  # joint -> [K]
 class LogMotion:
     """Means of the repeats on one regular clock, low-passed at CUTOFF.
 
-    time: [K] s.  command: what position servos are sent to, position: as measured, torque: as measured; each joint ->
-    [K], in rad (m) and N m (N).  rows: at which inverse dynamics is computed, at most.
+    time: [K] s.  command: target of each position servo, rad (m).  position: measured, rad (m).  torque: measured,
+    N m (N); each of them joint -> [K].  rows: most rows at which inverse dynamics is computed.
     """
 
     time: np.ndarray
     command: Traces
     position: Traces
     torque: Traces
-    rows: int = ROWS
+    rows: int = MOST_ROWS
 
     @property
     def step(self) -> float:
@@ -53,8 +53,8 @@ class LogMotion:
 
     @property
     def inner(self) -> slice:
-        """Rows whose derivatives can be believed, `rows` of them at most."""
-        edge = max(2, round(EDGE / self.step))
+        """Rows away from both ends, where derivatives are accurate; at most `rows` of them."""
+        edge = max(2, round(EDGE_SECONDS / self.step))
         return slice(edge, len(self.time) - edge, max(1, (len(self.time) - 2 * edge) // self.rows))
 
     def scaled(self, factor: float) -> LogMotion:
@@ -70,7 +70,7 @@ class LogMotion:
         return replace(self, position={j: -x if j == joint else x for j, x in self.position.items()})
 
     def renamed(self, names: Mapping[str, str]) -> LogMotion:
-        """The same motion with columns under other joints' names in all signals; names: of those that change."""
+        """The same motion with joints renamed in all signals; names: old name -> new name, of joints that change."""
 
         def exchanged(traces: Traces) -> dict[str, np.ndarray]:
             return {names.get(joint, joint): x for joint, x in traces.items()}
@@ -80,9 +80,10 @@ class LogMotion:
 
 
 def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:
-    """The recording's signals of the scene's joints; None where it is too short or too sparse to be judged.
+    """The recording's signals of the scene's joints on one clock.
 
-    None too where commands are missing that the scene needs: the replay says so.
+    Returns None if the recording is too short or too sparse, or lacks commands that the scene needs (which the replay
+    reports).
     """
     if _commands(recording) and not set(scene.needs_command) <= set(recording.command_names):
         return None
@@ -96,7 +97,7 @@ def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:
     first, last = max(float(c[0]) for c in clocks), min(float(c[-1]) for c in clocks)
     rate = min(RATE, *(1.0 / float(np.median(np.diff(c.time))) for c in channels.values()))
     count = int((last - first) * rate) + 1
-    if last <= first or count < FEWEST:
+    if last <= first or count < FEWEST_ROWS:
         return None
     time = first + np.arange(count) / rate
     filtered = scipy.signal.butter(2, min(CUTOFF, rate / 5.0), fs=rate, output="sos")
@@ -117,14 +118,14 @@ def _commands(recording: Recording) -> bool:
 
 
 def _means(channel: Channel, time: np.ndarray, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Joint -> [K] mean over the repeats that measured enough of it."""
+    """Joint -> [K] mean over the repeats in which at least LEAST_MEASURED of its rows are measured."""
     found = {}
     for c, joint in enumerate(channel.columns):
         seen = channel.mask[:, :, c]
         traces = [
             np.interp(time, channel.time[mask], values[mask].astype(float))
             for mask, values in zip(seen, channel.values[:, :, c], strict=True)
-            if mask.mean() > MEASURED
+            if mask.mean() > LEAST_MEASURED
         ]
         if joint in joints and traces:
             found[joint] = np.mean(traces, axis=0)
@@ -135,7 +136,8 @@ def _means(channel: Channel, time: np.ndarray, joints: tuple[str, ...]) -> dict[
 class Expected:
     """Torques of one joint along the measured motion, at the scene's nominal values, [K] N m (N) each.
 
-    weight: what carries the arm.  inertial: inertia, Coriolis terms and springs.  velocity, acceleration: of the joint.
+    weight: gravity compensation.  inertial: inertia, Coriolis terms and springs.  velocity, acceleration: of the joint,
+    rad/s (m/s) and rad/s^2 (m/s^2).
     """
 
     weight: np.ndarray
@@ -147,8 +149,8 @@ class Expected:
 def rigid_body(scene: Scene, recording: Recording, motion: LogMotion) -> dict[str, Expected]:
     """Joint -> expected torques at the rows `motion.inner`, by inverse dynamics of the measured positions.
 
-    Empty where a measured joint of the scene, or one that carries it, has no measured position: what it does is not
-    known then.
+    Empty if a measured joint of the scene has no measured position, or the joints move on a free base: the motion is
+    then unknown.
     """
     moving = [j for j in motion.position if j in scene.single_joints]
     if not scene.joints or any(j not in moving for j in scene.joints) or scene.floating(scene.joints):
@@ -186,12 +188,15 @@ def rigid_body(scene: Scene, recording: Recording, motion: LogMotion) -> dict[st
 
 
 def _pose(scene: Scene, recording: Recording) -> np.ndarray:
-    """[nq] the scene's pose with what the recording states of its start."""
+    """[nq] the scene's pose with the initial positions that the recording states."""
     return scene.initial_qpos({j: q for j, q in recording.qpos0.items() if j in scene.single_joints})
 
 
 def servo_torque(scene: Scene, motion: LogMotion, joint: str, late: float) -> np.ndarray:
-    """[K] N m (N) of a joint's position servo at the measured motion, its command `late` s late, without limits."""
+    """[K] N m (N), torque of a joint's position servo along the measured motion, for a command delay of `late` s.
+
+    Force limits are ignored.
+    """
     u = scene.command_names.index(joint)
     gear, gain, bias = (
         scene.model.actuator_gear[u, 0], scene.model.actuator_gainprm[u], scene.model.actuator_biasprm[u]
@@ -203,9 +208,10 @@ def servo_torque(scene: Scene, motion: LogMotion, joint: str, late: float) -> np
 
 
 def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> dict[str, np.ndarray]:
-    """Joint -> [K] N m (N) of the actuators in a replay of the commands at nominal values; NaN where it blows up.
+    """Joint -> [K] N m (N), actuator torques in a replay of the commands at nominal values; NaN after a divergence.
 
-    The first SECONDS are replayed.  What the scene compensates of the weight is added where the torque contains it.
+    Only the first SIMULATED_SECONDS are replayed.  The scene's gravity compensation is added if the recorded torque
+    contains the weight.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:] = _pose(scene, recording)
@@ -213,7 +219,7 @@ def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> 
         if joint not in recording.qpos0:
             data.qpos[scene.qpos(joint)] = path[0]
     step = float(model.opt.timestep)
-    clock = np.arange(motion.time[0], min(motion.time[-1], motion.time[0] + SECONDS), step)
+    clock = np.arange(motion.time[0], min(motion.time[-1], motion.time[0] + SIMULATED_SECONDS), step)
     control = np.tile(holding(scene, data.qpos.copy()), (len(clock), 1))
     for u in np.flatnonzero(has_feedback(model) & scene.of_joint):
         if scene.command_names[u] in motion.command:
@@ -224,7 +230,7 @@ def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> 
     for k, now in enumerate(control):
         data.ctrl[:] = now
         mujoco.mj_step(model, data)
-        if data.warning.number.any():  # it blew up, or ran out of memory: nothing can be said
+        if data.warning.number.any():  # the replay diverged, or ran out of memory
             break
         out[k] = data.qfrc_actuator[dofs] + share * data.qfrc_gravcomp[dofs]
     rows = np.where(motion.time <= clock[-1], np.searchsorted(clock, motion.time), -1)
@@ -236,12 +242,12 @@ def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> 
 
 
 def compensated(scene: Scene, recording: Recording, motion: LogMotion) -> dict[str, np.ndarray]:
-    """Joint -> [K] N m (N), the weight that the scene compensates beside the servos (gravcomp) along the motion."""
+    """Joint -> [K] N m (N), gravity compensation of the scene (gravcomp) along the motion."""
     model, data = scene.model, mujoco.MjData(scene.model)
     if not model.body_gravcomp.any():
         return {joint: np.zeros(len(motion.time)) for joint in scene.joints}
     known = {scene.qpos(joint): path for joint, path in {**motion.command, **motion.position}.items()}
-    rows = np.arange(len(motion.time))[:: max(1, len(motion.time) // ROWS)]
+    rows = np.arange(len(motion.time))[:: max(1, len(motion.time) // MOST_ROWS)]
     start, out = _pose(scene, recording), np.empty((len(rows), len(scene.joints)))
     for i, k in enumerate(rows):
         data.qpos[:] = start

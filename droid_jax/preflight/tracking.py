@@ -1,5 +1,4 @@
-"""Whether the measured positions follow the commands: sign, unit and order of the joints; and whether any joint could
-move as fast as the positions say."""
+"""Check measured positions against commands: sign, unit and order of the joints, and plausible speeds."""
 
 from __future__ import annotations
 
@@ -14,27 +13,27 @@ from droid_jax.preflight.signals import LogMotion
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.initial_state import sent_to
 
-MOVES = 0.01  # rad or m (of both, in their own units): a joint that is sent less far tells nothing
-LATEST = 0.15  # s by which a position may lag its command; of faster swings than half of it no sign is told
-FOLLOWS = 0.9  # correlation from which on a position follows a command, and its size can be compared
-AGAINST = -0.8  # correlation at which it runs against it
-UNRELATED = 0.3  # correlation below which it does not follow its own command at all
-UNLIKE = 0.02  # share of the positions' variance that the stated order leaves, from which on another is looked for
-BETTER = 0.2  # of that share, which the other order may leave
-RATIO = 3.0  # a servo that goes a third, or three times, as far as it is sent has other units
-SAME = 0.25  # relative deviation within which a ratio is that of known units
-STUCK = 1e-3  # of the way it is sent: a position that moves less does not move, or is not measured
-FASTEST = {"hinge": 30.0, "slide": 10.0}  # rad/s, m/s: no arm, leg or gripper is as fast; wheels turn one way
-TURN, NEAR = 2 * np.pi, 0.1  # rad; relative deviation within which a step is one turn
+LEAST_TRAVEL = 0.01  # rad or m: joints with a smaller commanded travel are not checked
+LONGEST_DELAY = 0.15  # s, largest lag of a position; no sign is checked for oscillations with a shorter half-period
+FOLLOWING = 0.9  # correlation above which a position follows a command, and their sizes are compared
+OPPOSING = -0.8  # correlation below which a position is opposite to its command
+UNRELATED = 0.3  # correlation below which a position does not follow its own command
+STATED_ORDER_RESIDUAL = 0.02  # unexplained share of the positions' variance above which another order is tested
+OTHER_ORDER_SHARE = 0.2  # the other order must reduce that share below this factor
+UNIT_RATIO = 3.0  # ratio of position to command, or its inverse, above which their units differ
+RATIO_TOLERANCE = 0.25  # relative tolerance on the ratio of known units
+STUCK_SHARE = 1e-3  # share of the commanded travel: a position that moves less is not measured, or in another unit
+FASTEST = {"hinge": 30.0, "slide": 10.0}  # rad/s, m/s: faster than any arm, leg or gripper; wheels turn one way
+TURN, TURN_TOLERANCE = 2 * np.pi, 0.1  # rad; relative tolerance on a step of one turn
 _UNITS = {"hinge": {180 / np.pi: "degrees"}, "slide": {1000.0: "millimetres", 100.0: "centimetres"}}
 
 
 def check_tracking(scene: Scene, recording: Recording, motion: LogMotion) -> list[Finding]:
-    """What is wrong with positions and commands."""
+    """Findings about positions and commands."""
     where = f"recording {recording.name!r}"
     wrapped = _wrapped(scene, recording, motion, where)
     paths = {j: path for j, path in motion.position.items() if j not in wrapped}
-    joints = [j for j in motion.command if j in paths and np.ptp(motion.command[j]) > MOVES]
+    joints = [j for j in motion.command if j in paths and np.ptp(motion.command[j]) > LEAST_TRAVEL]
     found = _order(motion, joints, where)
     if not found:
         for joint in joints:
@@ -43,7 +42,7 @@ def check_tracking(scene: Scene, recording: Recording, motion: LogMotion) -> lis
 
 
 def _wrapped(scene: Scene, recording: Recording, motion: LogMotion, where: str) -> dict[str, Finding]:
-    """Joint -> what is said of a hinge whose measured or commanded angle starts over after each turn."""
+    """Joint -> finding for a hinge whose measured or commanded angle wraps after each turn."""
     hinges = [j for j in scene.single_joints if not scene.slides(j)]
     tracks = list[tuple[str, str, np.ndarray, np.ndarray]]()
     if channel := recording.channels.get("position"):
@@ -51,29 +50,29 @@ def _wrapped(scene: Scene, recording: Recording, motion: LogMotion, where: str) 
         tracks += [("position", j, channel.time, p) for i, j in enumerate(channel.columns) for p in seen[..., i]]
     for joint, path in (sent_to(scene, recording) if recording.command.size else {}).items():
         position = np.interp(recording.time, motion.time, motion.position.get(joint, np.full_like(motion.time, np.nan)))
-        if np.std(np.unwrap(path) - position) < np.std(path - position):  # else it is sent a turn further, and goes
+        if np.std(np.unwrap(path) - position) < np.std(path - position):  # otherwise the joint does make that turn
             tracks.append(("command", joint, recording.time, path))
     found = dict[str, Finding]()
     for what, joint, time, path in tracks:
         steps = np.nan_to_num(np.abs(np.diff(path)))
-        turns = np.flatnonzero(np.abs(steps - TURN) < NEAR * TURN)
+        turns = np.flatnonzero(np.abs(steps - TURN) < TURN_TOLERANCE * TURN)
         if joint not in hinges or not len(turns):
             continue
-        # Degrees and counts have steps of all sizes, and with a slow clock a wheel may turn once from row to row.
+        # Degrees and counts have steps of all sizes, and on a slow clock a wheel may make one turn per row.
         others, longest = np.delete(steps, turns).max(initial=0.0), np.diff(time)[turns].max()
         if others < TURN / 2 and longest < TURN / FASTEST["hinge"]:
             at = float(time[turns[0]])
             sentence = (
                 f"{where}: the {what} of {joint} jumps by one turn from one sample to the next, at {at:.4g} s: the log "
-                "counts within one turn; unwrap it (numpy.unwrap) before it is converted"
+                "is wrapped to one turn; unwrap it (numpy.unwrap) before it is converted"
             )
             found.setdefault(joint, Finding("units", joint, float(steps[turns[0]]), 0.0, "certain", sentence))
     return found
 
 
 def correlations(motion: LogMotion, sent: str, measured: str) -> tuple[np.ndarray, np.ndarray]:
-    """[L] correlation of a position with a command, and [L] the ratio of their deviations, at lags up to LATEST."""
-    most = max(1, min(round(LATEST / motion.step), len(motion.time) // 4))
+    """Correlation [L] of a position with a command, and ratio [L] of their deviations, at lags up to LONGEST_DELAY."""
+    most = max(1, min(round(LONGEST_DELAY / motion.step), len(motion.time) // 4))
     pairs = []
     for lag in range(most + 1):
         command = motion.command[sent][: len(motion.time) - lag]
@@ -88,7 +87,7 @@ def correlations(motion: LogMotion, sent: str, measured: str) -> tuple[np.ndarra
 
 
 def _of_joint(scene: Scene, motion: LogMotion, joint: str, where: str) -> list[Finding]:
-    if np.ptp(motion.position[joint]) < STUCK * np.ptp(motion.command[joint]):
+    if np.ptp(motion.position[joint]) < STUCK_SHARE * np.ptp(motion.command[joint]):
         unit = "m" if scene.slides(joint) else "rad"
         return [
             Finding(
@@ -98,7 +97,7 @@ def _of_joint(scene: Scene, motion: LogMotion, joint: str, where: str) -> list[F
             )
         ]  # fmt: skip
     r, ratios = correlations(motion, joint, joint)
-    if r.max() < 0 and r.min() < AGAINST:
+    if r.max() < 0 and r.min() < OPPOSING:
         return [
             Finding(
                 "sign", joint, float(r.min()), 1.0, "certain",
@@ -107,17 +106,17 @@ def _of_joint(scene: Scene, motion: LogMotion, joint: str, where: str) -> list[F
             )
         ]  # fmt: skip
     best = int(np.argmax(r))
-    if r[best] < FOLLOWS or 1 / RATIO < ratios[best] < RATIO:
+    if r[best] < FOLLOWING or 1 / UNIT_RATIO < ratios[best] < UNIT_RATIO:
         return []
     return [_ratio(scene, joint, float(ratios[best]), where)]
 
 
 def _ratio(scene: Scene, joint: str, ratio: float, where: str) -> Finding:
-    """Of a position that follows its command, but is `ratio` times as large."""
+    """Finding for a position that follows its command but is `ratio` times as large."""
     units, certain = "are both in the same unit?", False
     for size, unit in _UNITS["slide" if scene.slides(joint) else "hinge"].items():
         for of, what in ((ratio / size, "position"), (1 / (ratio * size), "command")):
-            if abs(of - 1) < SAME:
+            if abs(of - 1) < RATIO_TOLERANCE:
                 units, certain = f"is the {what} in {unit}?", what == "position"
     return Finding(
         "units", joint, ratio, 1.0, "certain" if certain else "likely",
@@ -126,18 +125,18 @@ def _ratio(scene: Scene, joint: str, ratio: float, where: str) -> Finding:
 
 
 def _order(motion: LogMotion, joints: list[str], where: str) -> list[Finding]:
-    """Joints of which each follows another one's command, and not its own: of all orders the one that fits best."""
+    """Finding for positions that follow the commands of other joints, in the order that fits best."""
     if len(joints) < 2:
         return []
     r = np.array([[correlations(motion, sent, seen)[0].max() for sent in joints] for seen in joints])
     seen, sent = linear_sum_assignment(-r)
     wrong = [(i, j) for i, j in zip(seen, sent, strict=True) if i != j]
-    if not wrong or any(r[i, j] < FOLLOWS for i, j in wrong):
+    if not wrong or any(r[i, j] < FOLLOWING for i, j in wrong):
         return []
-    share = 1 - np.maximum(r, 0.0) ** 2  # of a position's variance that a command leaves
+    share = 1 - np.maximum(r, 0.0) ** 2  # unexplained share of each position's variance, for each command
     unlike = float(np.mean([share[i, i] for i, _ in wrong]))
     left = float(np.mean([share[i, j] for i, j in wrong]))
-    if unlike < UNLIKE or left > BETTER * unlike:  # commands that are much alike tell no order
+    if unlike < STATED_ORDER_RESIDUAL or left > OTHER_ORDER_SHARE * unlike:  # similar commands determine no order
         return []
     pairs = ", ".join(f"{joints[i]} follows the command of {joints[j]}" for i, j in wrong)
     first = int(wrong[0][0])
@@ -150,7 +149,7 @@ def _order(motion: LogMotion, joints: list[str], where: str) -> list[Finding]:
 
 
 def _too_fast(scene: Scene, motion: LogMotion, where: str) -> list[Finding]:
-    """Joints that go to and fro faster than any robot's."""
+    """Finding for joints that move to and fro faster than any robot."""
     for joint, path in motion.position.items():
         slides = scene.slides(joint)
         speed = motion.rate_of(path)[motion.inner]

@@ -1,4 +1,4 @@
-"""Repeats of one motion put together: one clock, one command, where the motion starts.  For logs of any kind."""
+"""Puts the repeats of one motion, from any logs, on one clock, and gives their command and initial positions."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from droid_jax.recordings.recording import Channel
 
 
 def common_clock(times: Sequence[np.ndarray], rate: float | None, places: Sequence[object]) -> np.ndarray:
-    """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on.
+    """Uniform instants [T] s, multiples of one step, over the part from 0 on that all repeats cover.
 
     Args:
         times: stamps [M] s of each repeat.
-        rate: Hz; the usual one of the first repeat by default.
+        rate: Hz; by default that of the first repeat's median step.
         places: where each repeat comes from, for messages.
 
     Raises:
@@ -45,11 +45,13 @@ def one_command(
     tolerance: float,
     places: Sequence[object],
 ) -> np.ndarray:
-    """[T, U] the first repeat's command; ValueError when another one differs by more than the tolerance.
+    """The first repeat's command [T, U]; ValueError when another repeat's differs by more than the tolerance.
 
     Args:
-        commands: [T, U] of each repeat, rad or m, on one clock [T] s.
-        clock: of them.  joints: U names.  tolerance: rad or m.
+        commands: [T, U] of each repeat, rad or m, all on the same clock.
+        clock: instants [T] s of the commands.
+        joints: U names.
+        tolerance: rad or m.
         places: where each repeat comes from, for messages.
     """
     for place, command in zip(places[1:], commands[1:], strict=True):

@@ -1,4 +1,4 @@
-"""What one ROS message says of joints: their names, and numbers by field, of a state or of a command.
+"""Reads one ROS message of a state or a command: the names of joints, and their numbers by field.
 
 Message types are recognised by their fields, so that their package and version do not matter.
 """
@@ -36,12 +36,14 @@ _MOTOR: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is read of a topic.
+    """What is read from a topic.
 
-    topic: its name.  joints: their names, in the order wanted.  needed: the field whose numbers must all be finite.
-    role: whether a message is asked for its state or for its command, where it holds both.
-    motors: places of the joints in messages without names that hold more of them, counted from 0.
-    shared: whether state and command are read of one topic.
+    topic: name of the topic.
+    joints: names of the joints, in the order wanted.
+    needed: the field whose numbers must all be finite.
+    role: whether state or command is read from messages that hold both.
+    motors: positions of the joints, counted from 0, in messages without names that hold more numbers than joints.
+    shared: whether state and command are read from the same topic.
     """
 
     topic: str
@@ -56,18 +58,22 @@ Sample = tuple[int, tuple[str, ...], dict[str, np.ndarray]]  # offset in ns, joi
 
 
 def samples(message: Any, wanted: Wanted, kind: str, where: str) -> list[Sample]:
-    """What one message holds; several samples of a trajectory.
+    """The sample in one message, or the several samples of a trajectory.
 
     Args:
-        message: as rosbags reads it.  wanted: of its topic.
-        kind: its type.  where: of it, for messages of errors.
+        message: as rosbags reads it.
+        wanted: what is read from its topic.
+        kind: type of the message.
+        where: the message's place in the bag, for error messages.
 
     Raises:
-        ValueError: it is of no type that is read, or has another number of joints.
+        ValueError: messages of this type are not read, or the message has another number of joints.
     """
     if hasattr(message, "name") and hasattr(message, "position"):  # JointState
         if wanted.shared:
-            raise ValueError(f"{where}: command and joint states need topics of their own, not {wanted.topic!r} both")
+            raise ValueError(
+                f"{where}: commands and joint states must come from two topics, not both from {wanted.topic!r}"
+            )
         return [(0, tuple(message.name), _joint_state(message))]
     if hasattr(message, "measured_joint_state"):  # FrankaRobotState, of franka_ros2
         inner = message.measured_joint_state if wanted.role == "state" else message.desired_joint_state
@@ -94,12 +100,12 @@ def samples(message: Any, wanted: Wanted, kind: str, where: str) -> list[Sample]
 
 
 def in_nanoseconds(duration: Any) -> int:
-    """Of a time or duration of ROS."""
+    """Nanoseconds of a ROS time or duration."""
     return duration.sec * 10**9 + duration.nanosec
 
 
 def setpoints(point: Any) -> dict[str, np.ndarray]:
-    """field -> numbers of a trajectory point: positions, and what stands beside them."""
+    """Field -> numbers of a trajectory point: positions, and velocities and efforts where there are as many."""
     found = {"position": np.asarray(getattr(point, "positions", ()), dtype=np.float64)}
     for field, of_point in {"velocity": "velocities", "effort": "effort"}.items():
         numbers = np.asarray(getattr(point, of_point, ()), dtype=np.float64)
@@ -117,7 +123,7 @@ def _attributes(message: Any, of: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 
 def _controller_point(message: Any, role: str) -> Any:
-    """The trajectory point of a JointTrajectoryControllerState, whose parts older versions call otherwise."""
+    """The trajectory point of a JointTrajectoryControllerState; older versions use other names for its fields."""
     for name in ("reference", "desired") if role == "command" else ("feedback", "actual"):
         if hasattr(message, name):
             return getattr(message, name)
@@ -125,7 +131,7 @@ def _controller_point(message: Any, role: str) -> Any:
 
 
 def _interfaces(message: Any) -> dict[str, np.ndarray]:
-    """field -> numbers of a DynamicJointState; NaN where a joint has no such interface."""
+    """Field -> numbers of a DynamicJointState; NaN where a joint has no such interface."""
     found = {field: np.full(len(message.joint_names), np.nan) for field in FIELDS.values()}
     for joint, interfaces in enumerate(message.interface_values[: len(message.joint_names)]):
         for name, value in zip(interfaces.interface_names, interfaces.values, strict=False):
@@ -135,7 +141,7 @@ def _interfaces(message: Any) -> dict[str, np.ndarray]:
 
 
 def _unnamed(fields: Mapping[str, np.ndarray], wanted: Wanted, where: str) -> list[Sample]:
-    """The numbers of a message without names, at the places of the joints."""
+    """The joints' numbers in a message without names."""
     joints, count = wanted.joints, len(next(iter(fields.values())))
     if wanted.motors is None and count != len(joints):
         raise ValueError(

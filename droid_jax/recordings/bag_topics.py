@@ -1,6 +1,6 @@
-"""What the topics of one ROS bag hold: time stamps, and numbers by field, of the joints that are asked for.
+"""Reads the topics of one ROS bag: time stamps, and numbers by field, of the joints that are asked for.
 
-Joint states, trajectories, arrays of numbers and states of a controller become the same thing, a `Track`.
+Joint states, trajectories, arrays of numbers and controller states all become a `Track`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,16 @@ _DAY = 86400 * 10**9  # ns
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One topic of one bag: bag and header stamps [M] ns, and values [M, J] by field.
+    """One topic of one bag.
 
-    A field that all messages leave empty is absent; where some do, their rows are NaN.  Header stamps are None without
-    headers.
-    Stamps stay integers: nanoseconds since 1970 do not fit a float64.
-    numbers: [M] which message of the topic each row is of; a trajectory has several.
-    topic: its name.
+    A field that all messages leave empty is absent.  Where only some messages leave it empty, their rows are NaN.
+    Stamps are integers, because nanoseconds since 1970 do not fit a float64.
+
+    received: the recorder's stamps [M] ns.
+    stamped: header stamps [M] ns; None where messages have no headers.
+    fields: name -> values [M, J].
+    numbers: for each of the M rows, the number of its message in the topic; a trajectory has several rows.
+    topic: name of the topic.
     """
 
     received: np.ndarray
@@ -90,7 +93,7 @@ def _read_topic(reader: AnyReader, bag: Path, topic: str, wanted: Wanted) -> Tra
     without = [number for number, row in zip(numbers, rows, strict=True) if needed not in row]
     if without and len(without) < len(rows):
         raise ValueError(f"{bag}, topic {topic!r}, message {without[0]}: holds no {needed}, as others of the topic do")
-    bare = np.full(len(joints), np.nan)  # a field that only some messages leave empty was not measured there
+    bare = np.full(len(joints), np.nan)  # for messages that leave a field empty
     fields = {key: np.array([row.get(key, bare) for row in rows]) for key in {k: None for row in rows for k in row}}
     return Track(np.array(received, dtype=np.int64), _header_stamps(stamped), fields, tuple(numbers), topic)
 
@@ -114,9 +117,9 @@ def _header_stamps(stamped: Sequence[int | None]) -> np.ndarray | None:
 def _pick(
     fields: Mapping[str, np.ndarray], names: tuple[str, ...], wanted: Wanted, where: str
 ) -> dict[str, np.ndarray] | None:
-    """field -> [J] numbers of the joints wanted, without empty fields; finite in the field `needed`.
+    """Field -> numbers [J] of the joints wanted, without empty fields; finite in the field `needed`.
 
-    None when the message has none of them: arm and gripper often share a topic.
+    None when the message has none of these joints: arm and gripper often share a topic.
     """
     joints = wanted.joints
     missing = [j for j in joints if j not in names]
@@ -141,14 +144,14 @@ def _pick(
 
 
 def _remedy(missing: Sequence[str], names: Sequence[str], wanted: Wanted) -> str:
-    """How to read a joint that messages name with a prefix or a suffix, or without; nothing where there is none."""
+    """Advice where messages name a missing joint with another prefix or suffix; empty where no name is similar."""
     option = "--joints" if wanted.role == "state" else "--command-joints"
     for joint in missing:
         for name in names:
             short, long = sorted((joint, name), key=len)
             if short and re.fullmatch(rf"(.*[\W_])?{re.escape(short)}([\W_].*)?", long):
                 return (
-                    f"; if {joint!r} is called {name!r} there, say so for each: {option} NAME={name}, where NAME is "
-                    "that in the MJCF"
+                    f"; if {joint!r} is called {name!r} there, give both names of each joint: {option} NAME={name}, "
+                    "where NAME is its name in the MJCF"
                 )
     return ""

@@ -1,7 +1,7 @@
-"""What a recording must fulfil: `validate`, and `check_joints` against a robot's joints.
+"""Checks that a recording is valid (`validate`) and that its joints are those of a robot (`check_joints`).
 
-`validate` is called once, on the host, by whoever made the recording (a file reader, a
-simulated robot); everything behind it may rely on what it checks.
+`validate` is called once, by the code that made the recording (a file reader, a simulated robot).  All code that
+receives the recording may rely on it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from droid_jax.recordings.recording import (
     TorqueConvention,
 )
 
-# Of the channels that a replay has, at hinges and at slides; a channel of both says "N m or N".
+# Units of the channels that a replay has, for hinges and for slides; a channel of both says "N m or N".
 UNITS = {
     "torque": ("N m", "N"),
     "position": ("rad", "m"),
@@ -38,11 +38,15 @@ UNITS = {
 
 
 def validate(recording: Recording, *, source: str = "", allow_jitter: bool = False) -> Recording:
-    """The recording itself, or ValueError that says what is wrong and where.
+    """The recording itself, if it is valid.
 
-    source:       file or folder the recording came from, for the message; its name otherwise.
-    allow_jitter: accept clocks whose steps differ from their median by more than half of it.
-    Rows and repeats in messages count from 0, as numpy does.
+    Args:
+        recording: what is checked.
+        source: file or folder the recording came from, for the message; by default the recording's name is given.
+        allow_jitter: accept clocks whose steps differ from their median by more than half of it.
+
+    Raises:
+        ValueError: the message says what is wrong and where; rows and repeats count from 0, as numpy does.
     """
     instance(recording, "a recording", Recording)
     where = source or f"recording {shown(recording.name)}"
@@ -70,7 +74,7 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
 
 
 def accept(recording: Recording, source: str, allow_jitter: bool) -> Recording:
-    """The recording, valid; one whose clocks are irregular is accepted where it is asked for, and says so in `meta`.
+    """The recording, validated; irregular clocks are accepted on request, and `meta` then says so.
 
     Args:
         recording: as it was read.
@@ -112,13 +116,13 @@ def _check_types(recording: Recording, where: str) -> None:
 
 
 def _check_texts(recording: Recording, where: str) -> None:
-    """ValueError for a text that cannot be printed or is too long: page and tables hold all of them."""
+    """ValueError for a text that cannot be printed or is too long: the page and the tables show all of them."""
     for joint in recording.qpos0:
         name(joint, f"{where}: a joint of qpos0")
     for parameter, value in recording.known.items():
         name(parameter, f"{where}: a parameter of known")
         if isinstance(value, str):
-            name(value, f"{where}: what stands for {parameter!r}")
+            name(value, f"{where}: the parameter named for {parameter!r}")
     for key, channel in recording.channels.items():
         name(key, f"{where}: a channel's name")
         name(channel.unit, f"{where}, channel {key!r}: unit", empty=True)
@@ -129,11 +133,15 @@ def _check_texts(recording: Recording, where: str) -> None:
 
 
 def check_joints(recording: Recording, joints: Sequence[str], also: Sequence[str] = ()) -> None:
-    """ValueError unless the recording speaks of exactly these robot joints, in any order; those of `also` may be there.
+    """ValueError unless the recording has exactly these robot joints, in any order.
 
-    The command must have a column for each of them; in a log without commands the torque,
-    position and velocity channels together must.  No such column may bear another name; other
-    channels (a door's angle) are not looked at.
+    The command must have a column for each joint.  In a log without commands, the torque, position and velocity
+    channels together must.  Other channels (a door's angle) are not checked.
+
+    Args:
+        recording: what is checked.
+        joints: names that must be there.
+        also: names that may be there besides.
     """
     where = f"recording {recording.name!r}"
     known = {k: recording.channels[k].columns for k in JOINT_CHANNELS if k in recording.channels}

@@ -1,4 +1,4 @@
-"""Clocks of measurements: whether one can be right, and several repeats on a common one."""
+"""Checks the clock of a measurement, and interpolates repeats onto a common clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 SLACK = 1e-6  # s, two instants closer than this are the same
 _DAY = 86400.0  # s
-_GAP = 5.0  # usual steps; a longer silence counts as unmeasured
+_GAP = 5.0  # median steps; between stamps further apart, nothing counts as measured
 _JITTER = 0.5  # largest deviation of a clock's step from its median, as a fraction
 
 
@@ -23,8 +23,13 @@ def check_clock(
 ) -> None:
     """ValueError unless time [T] is finite, in seconds, strictly increasing and regular.
 
-    where: what the clock belongs to; seconds: whether its unit is in question; label: row index -> how the message
-    calls that row; remedy: for stamps that repeat, ends the message.
+    Args:
+        time: instants [T].
+        where: what the clock belongs to, for messages.
+        allow_jitter: accept steps that are irregular.
+        seconds: also check that the numbers can be seconds.
+        label: row index -> name of that row in messages.
+        remedy: end of the message about stamps that repeat.
     """
     bad = np.flatnonzero(~np.isfinite(time))
     if bad.size:
@@ -77,7 +82,7 @@ def interpolate(clock: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.n
 
 
 def in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """[T] bool of clock [T] s, True strictly between two stamps of time [M] s further apart than _GAP usual steps."""
+    """[T] bool of clock [T] s, True strictly between two stamps of time [M] s further apart than _GAP median steps."""
     if len(time) < 2:
         return np.zeros(len(clock), bool)
     steps = np.diff(time)
@@ -87,12 +92,18 @@ def in_gap(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def resample(times: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Repeats with clocks of their own -> one clock [Tc] s and values [N, Tc, C].
+    """Interpolates repeats with different clocks onto one clock.
 
-    times:  N arrays [T_r] s;  values: N arrays [T_r, C], NaN where nothing was measured.
+    Args:
+        times: N arrays [T_r] s.
+        values: N arrays [T_r, C], NaN where nothing was measured.
 
-    The clock is the first repeat's, cut to the part that all repeats cover; in between, values are interpolated
-    linearly, and are NaN where either neighbour is and in gaps (`in_gap`).  Raises ValueError when no part is common.
+    Returns:
+        The first repeat's clock [Tc] s, cut to the part that all repeats cover, and values [N, Tc, C], interpolated
+        linearly.  They are NaN where either neighbour is, and in gaps (`in_gap`).
+
+    Raises:
+        ValueError: no part is covered by all repeats.
     """
     first, last = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
     clock = times[0][(times[0] >= first - SLACK) & (times[0] <= last + SLACK)]

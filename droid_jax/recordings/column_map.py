@@ -1,7 +1,7 @@
-"""Which columns of a log are what: `ColumnMap`, read from and written to a small TOML file.
+"""The meaning of a log's columns: `ColumnMap`, read from and written to a small TOML file.
 
-A map says what a table, an npz, an HDF5 file or a dataset does not say by itself: which columns hold commands and
-measurements, in which units, of which joints.  The same map reads every log of its kind.
+A map states which columns of a table, an npz, an HDF5 file or a dataset hold commands and measurements, in which units
+and of which joints.  One map reads all logs with the same columns.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ HEAD = "# Column map of droid_jax: `python -m droid_jax.run convert LOG --map TH
 MOST_BYTES = 2**18  # of a map
 CHANNELS = ("command", "position", "velocity", "torque", "object_angle")
 _POSITIONS = ("command", "position", "velocity", "object_angle")
-# kind of `Units` -> what may state a unit of its own
+# kind of `Units` -> entries of a map that may state a unit themselves
 _STATE = {"angle": _POSITIONS, "length": _POSITIONS, "torque": ("torque",), "force": ("torque",), "time": ("time",)}
-LAYOUTS = Path(__file__).parent / "layouts"  # maps of layouts that many use
+LAYOUTS = Path(__file__).parent / "layouts"  # maps of widely used layouts
 
 
 class ChannelMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
     """Columns of one channel, or of the command.
 
-    columns: a name, or one name per joint.  `{n}` in a name stands for a number, `{joint}` for the joint's name, and
-        `[0:3]` or `[2,5]` behind a name for some components of a column of vectors.
-    unit: of the numbers, or one per joint (`droid_jax.recordings.units`); that of `ColumnMap.units` otherwise.
-    file: of a log of several files: the file's name in the folder, `*` for any characters.
+    columns: a name, or one name per joint.  In a name, `{n}` stands for a number and `{joint}` for the joint's name.
+        `[0:3]` or `[2,5]` behind a name selects components of a column of vectors.
+    unit: unit of the numbers, or one per joint (`droid_jax.recordings.units`); that of `ColumnMap.units` by default.
+    file: name of the file in a log of several files, `*` for any characters.
     time: the time column of that file, where it has another name.
-    scale: factor on the numbers, e.g. -1 where an axis points the other way.  zero: what the log reads where the model
-        has 0, in the log's unit.
-    counts_per_turn: of an encoder, with the unit "counts".
+    scale: factor on the numbers, e.g. -1 where an axis points the other way.
+    zero: the log's number where the model has 0, in the log's unit.
+    counts_per_turn: counts of the encoder in one turn, with the unit "counts".
     range: lowest and highest position of each joint (or of all), rad or m, with the unit "normalised" or "percent".
-    torque_constant: N m (N) that one A or one % is, with the units "A", "mA", "%".
-    joints: whose numbers these are, where other than `ColumnMap.joints`.
+    torque_constant: N m (N) per A or per %, with the units "A", "mA", "%".
+    joints: joints of these numbers, where they are not `ColumnMap.joints`.
     """
 
     columns: str | list[str]
@@ -65,7 +65,7 @@ class TimeMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, fr
 
 
 class Units(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
-    """Units of all channels whose own entry states none; speeds are per second of angle and length."""
+    """Units of all channels whose entry states none; the unit of speeds is that of angle or length, per second."""
 
     angle: str | None = None
     length: str | None = None
@@ -75,17 +75,19 @@ class Units(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, froz
 
 
 class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, frozen=True):
-    """What the columns of a log are.
+    """The meaning of a log's columns.
 
-    joints: measured joints, named as in the MJCF.  slides: those of them that slide.
-    time: the stamps; without them `rate` is that of the rows.
-    command, position, velocity, torque, object_angle: columns of each; a name stands for a whole `ChannelMap`.
-    powered: a column that is 0 (or false) where the motors are off, of the file that holds the command: the longest
-        stretch in which they are on is read.
-    side, gravity: of the torque, as in a recording.
-    stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad; without damping the scene's counts.
-    rate: Hz; with a column of time, of the common clock that everything is interpolated onto.
-    units: of all channels.
+    joints: measured joints, named as in the MJCF.
+    slides: those of the joints that slide.
+    time: columns of the time stamps; without them, `rate` is the rate of the rows.
+    command, position, velocity, torque, object_angle: columns of each channel; a name alone stands for a `ChannelMap`
+        with this name.
+    powered: a column that is 0 (or false) where the motors are off, in the file that holds the command.  Only the
+        longest interval in which they are on is read.
+    side, gravity: convention of the torque, as in a recording.
+    stiffness, damping: gains of the commanded joints, N m/rad and N m s/rad; without damping, the scene's is used.
+    rate: Hz; with a column of time, the rate of the common clock that everything is interpolated onto.
+    units: units of all channels whose entry states none.
     """
 
     joints: list[str] = []
@@ -105,13 +107,13 @@ class ColumnMap(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, 
     units: Units = Units()
 
     def channel(self, name: str) -> ChannelMap | None:
-        """The entry of a channel as a whole one; None where the map has none."""
+        """The entry of a channel as a `ChannelMap`; None where the map has none."""
         entry = getattr(self, name)
         return entry if entry is None or isinstance(entry, ChannelMap) else ChannelMap(entry)
 
     @property
     def stamps(self) -> TimeMap | None:
-        """The entry of the time; its unit is that of `units` unless it states one."""
+        """The entry of the time, with the unit of `units` unless it states one."""
         entry = self.time if self.time is None or isinstance(self.time, TimeMap) else TimeMap(self.time)
         if entry is None or entry.unit is not None:
             return entry
@@ -123,7 +125,7 @@ def read_map(path: str | Path) -> ColumnMap:
 
     Raises:
         OSError: there is no such file.
-        ValueError: it is no TOML, has unknown keys or values of another kind, or maps nothing.
+        ValueError: the file is not TOML, has unknown keys or values of another kind, or maps no measured channel.
     """
     known = layouts()
     if str(path) in known:
@@ -145,13 +147,13 @@ def layouts() -> dict[str, Path]:
 
 
 def check_map(columns: ColumnMap, where: str) -> ColumnMap:
-    """The map itself; ValueError where it says nothing, or contradicts itself."""
+    """The map itself; ValueError where it maps no measured channel or contradicts itself."""
     if not any(columns.channel(name) for name in CHANNELS if name != "command"):
         raise ValueError(f"{where}: maps no measured channel: give the columns of position, velocity or torque")
     if columns.torque is not None and (columns.side is None or columns.gravity is None):
         raise ValueError(
-            f'{where}: maps a torque but does not say which: give side = "motor" or "link" (--torque), and gravity = '
-            "true where it contains the arm's weight (--gravity), false where not"
+            f'{where}: maps a torque but does not state its convention: give side = "motor" or "link" (--torque), and '
+            "gravity = true where it contains the arm's weight (--gravity), false where not"
         )
     if columns.side not in (None, "motor", "link"):
         raise ValueError(f'{where}: side must be "motor" or "link", got {shown(columns.side)}')
@@ -176,16 +178,16 @@ def changed_map(
     unstated: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> ColumnMap:
-    """A map with what the command line says in place of its own; None: of nothing but that.
+    """A map changed by options of the command line.
 
     Args:
-        columns: the map that is changed.
+        columns: the map that is changed; None for a map that holds nothing but the changes.
         channels: channel or "time" -> columns, several with commas between them.
-        units: "angle", "length", "torque", "force", "time" -> unit, also of channels that state their own.
-        torque_constant: of the torque's columns, one for each joint or one for all; only where their unit is that of
-            a current.
+        units: "angle", "length", "torque", "force", "time" -> unit, also of channels whose entry states another.
+        torque_constant: of the torque's columns, one for each joint or one for all; used only where their unit is that
+            of a current.
         unstated: other fields of `ColumnMap`, where neither the map nor `changes` states them.
-        changes: other fields of `ColumnMap`; None and empty ones change nothing.  The side "none" takes the torque out.
+        changes: other fields of `ColumnMap`; None and empty ones change nothing.  The side "none" removes the torque.
     """
     where = "--columns"
     content: dict[str, Any] = {} if columns is None else msgspec.to_builtins(columns)
@@ -218,7 +220,7 @@ def changed_map(
 
 
 def _restated(entry: dict[str, Any], key: str, kind: str, unit: str) -> dict[str, Any]:
-    """A map's entry with its own unit of that kind, if it states one, replaced by another."""
+    """A map's entry in which the unit of that kind, if the entry states one, is replaced."""
     if not (own := as_list(entry.get("unit") or ())):
         return entry
     if key == "time":
@@ -227,7 +229,7 @@ def _restated(entry: dict[str, Any], key: str, kind: str, unit: str) -> dict[str
         return {name: value for name, value in entry.items() if name != "unit"}
     known = (SLIDES if kind in ("length", "force") else HINGES)[KINDS[key]]
     per = "/s" if key == "velocity" else ""  # not rpm, which is no angle per second
-    kept = {*COUNTS, *NORMALISED}  # these have numbers of their own beside them
+    kept = {*COUNTS, *NORMALISED}  # their conversion needs further numbers of the entry
     if per and unit in kept:
         return entry
     new = [f"{unit}{per}" if one in known and one not in kept and one.endswith(per) else one for one in own]
@@ -247,12 +249,12 @@ def _split(words: str) -> list[str]:
 
 
 def map_beside(target: Path) -> Path:
-    """Where the map of a converted recording is kept."""
+    """The file for the map of a converted recording."""
     return target.with_name(f"{target.stem if target.suffix == '.npz' else target.name}{SUFFIX}")
 
 
 def write_map(columns: ColumnMap, path: Path) -> None:
-    """Write a map; ValueError where something stands there that is no map of this program."""
+    """Write a map; ValueError where the file exists and is not a map of this program."""
     check_map_target(path)
     text = tomli_w.dumps(msgspec.to_builtins(columns))
     write_text(path, f"{HEAD}\n{text}")

@@ -27,7 +27,7 @@ MOST_COLUMNS = 1000
 
 
 def check_folder(path: Path) -> None:
-    """ValueError where a folder is not empty and holds anything but a recording: it would be lost."""
+    """ValueError where a folder holds anything but a recording, which writing would delete."""
     if path.is_dir() and any(path.iterdir()):
         if not (path / "recording.json").exists():
             raise ValueError(f"{path}: exists and is not a recording's folder, it is not replaced")
@@ -35,7 +35,7 @@ def check_folder(path: Path) -> None:
 
 
 def save_csv(recording: Recording, path: Path) -> None:
-    """Write a recording, which is taken to be valid; ValueError where the folder holds something else."""
+    """Write a valid recording; ValueError where the folder holds something else."""
     check_folder(path)
     with new_folder(path) as new:
         write_text(new / "recording.json", metadata_to_json(recording) + "\n")
@@ -58,7 +58,7 @@ def _only_a_recording(path: Path) -> None:
 
 
 def _metadata(path: Path) -> Metadata:
-    """What the recording.json of a folder says; ValueError names what is wrong with it."""
+    """The content of a folder's recording.json; ValueError says what is wrong with it."""
     file = path / "recording.json"
     text = read_text(file, most=MOST_BYTES)
     if not text.strip():
@@ -87,10 +87,15 @@ class _Table:
 
 
 def load_csv(path: Path, interpolate: bool, allow_jitter: bool) -> Recording:
-    """The recording in a folder, not yet validated; ValueError names the file and line that is wrong.
+    """The recording in a folder, not yet validated.
 
-    interpolate:  put repeats with clocks of their own on the first one's clock.
-    allow_jitter: accept irregular clocks.
+    Args:
+        path: of the folder.
+        interpolate: put repeats with different clocks on the first one's clock.
+        allow_jitter: accept irregular clocks.
+
+    Raises:
+        ValueError: the message names the file and line that is wrong.
     """
     meta = _metadata(path)
     allow_jitter = allow_jitter or JITTER in meta.meta
@@ -134,7 +139,7 @@ def _read_repeats(path: Path, key: str, columns: tuple[str, ...], allow_jitter: 
 def _read_table(path: Path, expected: Sequence[str], full: bool, allow_jitter: bool) -> _Table:
     """Reads one CSV file.
 
-    expected: column names that must be there, in the order wanted; empty takes the file's own.
+    expected: column names that must be there, in the order wanted; empty: those of the file.
     full:     an empty cell is an error (commands) rather than a missing measurement.
     """
     if check_size(path, MOST_TABLE) == 0:
@@ -162,7 +167,7 @@ def _read_table(path: Path, expected: Sequence[str], full: bool, allow_jitter: b
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """The lines of a table, none of them read beyond MOST_LINE characters."""
+    """The lines of a table; ValueError for one longer than MOST_LINE characters."""
     for number in itertools.count(1):
         line = file.readline(MOST_LINE + 1)
         if len(line) > MOST_LINE:

@@ -1,8 +1,8 @@
 """Recordings on disk: one npz file, or a folder of CSV files that any spreadsheet opens.
 
-`load_recording` also reads ROS bags, through `rosbag.py`, and logs of any column names, through `log_files.py`; what
-these need is imported only then.  The layouts are described in docs/file-formats.md.  The two formats that are written
-keep every number exactly: a recording that was saved and loaded has the same `sha256`.
+`load_recording` also reads ROS bags, through `rosbag.py`, and logs of any column names, through `log_files.py`; the
+packages that these need are imported only then.  docs/file-formats.md describes the layouts.  The two formats that are
+written keep every number exactly: a recording that was saved and loaded has the same `sha256`.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ def load_recording(
     Args:
         path: of the file, or of the folder.
         name: replaces the stored name.
-        resample: repeats with clocks of their own are interpolated onto the first's; those of bags always are, those
-            of an npz file share one.
-        allow_jitter: accept irregular clocks, see `validate`. A recording that was accepted says so in its `meta`, and
-            is read without being asked again once it is saved.
-        options: of ROS bags those of `rosbag.read_bags`, of which `joints` and `torque` are required; of other logs
+        resample: for CSV folders, interpolate repeats with different clocks onto the first's. Repeats of bags are
+            always interpolated; those of an npz file share one clock.
+        allow_jitter: accept irregular clocks, see `validate`. `meta` then says so, and the saved recording can be read
+            without this option.
+        options: for ROS bags those of `rosbag.read_bags`, of which `joints` and `torque` are required; for other logs
             (`log_files.is_log`) those of `log_files.read_log`: `columns`, `episodes`, ...
 
     Returns:
@@ -58,7 +58,7 @@ def load_recording(
 
     Raises:
         FileNotFoundError: there is no such path.
-        ValueError: something in the file is not as it should be (docs/file-formats.md).
+        ValueError: the file is not in its format (docs/file-formats.md) or the recording is not valid.
     """
     path = path_of(path, "the path of a recording")
     resample, allow_jitter = flag(resample, "resample"), flag(allow_jitter, "allow_jitter")
@@ -70,7 +70,7 @@ def load_recording(
     if log_files.is_log(path):
         return log_files.read_log([path], name=name, allow_jitter=allow_jitter, **options)[0]
     if options:
-        raise ValueError(f"{path}: a recording already, it takes no option {', '.join(sorted(options))}")
+        raise ValueError(f"{path}: is already a recording, for which there is no option {', '.join(sorted(options))}")
     if resample and path.suffix == ".npz" and not path.is_dir():
         raise ValueError(f"{path}: resample is for CSV folders; the repeats of an npz file share one clock already")
     if path.is_dir():
@@ -87,7 +87,7 @@ def load_recording(
 
 
 def check_target(path: Path) -> None:
-    """ValueError where `save_recording` would not write: another suffix, or what stands there is no recording."""
+    """ValueError where `save_recording` would not write: another suffix, or an existing file that is no recording."""
     if path.suffix not in ("", ".npz"):
         raise ValueError(f"{path}: expected the suffix .npz or none (a CSV folder), got {path.suffix!r}")
     if path.suffix == ".npz":
@@ -110,12 +110,12 @@ def save_recording(recording: Recording, path: str | os.PathLike[str]) -> Path:
         The path that was written.
 
     Raises:
-        ValueError: the recording is not valid, the suffix is another one, or something else stands there.
-        OSError: the place cannot be written.
+        ValueError: the recording is not valid, the suffix is another one, or the path exists and is no recording.
+        OSError: the path cannot be written.
     """
     path = path_of(path, "the path of a recording")
     check_target(path)
-    # Irregular clocks were a question when the data came in; here they are only kept.
+    # Irregular clocks were accepted, or refused, when the data were read.
     validate(recording, allow_jitter=True)
     if path.suffix == ".npz":
         save_npz(recording, path)
@@ -129,9 +129,9 @@ def _supported() -> str:
 
 
 def bags_at(path: Path) -> list[Path]:
-    """The ROS bags meant by a path, one per repeat, run_2 before run_10; none when it is something else.
+    """The ROS bags at a path, one per repeat, run_2 before run_10; none when there are no bags.
 
-    A folder with a recording.json is a recording, whatever lies beside its tables.
+    A folder with a recording.json is a recording, whatever other files it holds.
     """
 
     def is_bag(p: Path) -> bool:
@@ -150,7 +150,7 @@ def bags_at(path: Path) -> list[Path]:
 
 
 def rosbag_reader() -> ModuleType:
-    """`droid_jax.recordings.rosbag`, imported where bags are read; ValueError where what it needs is not installed."""
+    """The module `droid_jax.recordings.rosbag`; ValueError where the packages it needs are not installed."""
     needs("ROS bags need", "ros", "rosbags")
     return importlib.import_module("droid_jax.recordings.rosbag")
 

@@ -1,4 +1,4 @@
-"""HDF5 files as columns, robomimic's and DROID's among them; read with h5py."""
+"""Reads HDF5 files, such as robomimic's and DROID's, as columns, with h5py."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
 
     Args:
         path: of the file.
-        group: whose datasets are meant, "data/demo_0"; names are then as inside of it.
+        group: read only the datasets of this group ("data/demo_0"); their names are then relative to it.
 
     Raises:
-        ValueError: it is no HDF5 file, or has no such group.
+        ValueError: the file is not HDF5, or has no such group.
     """
     inside = f"{path}, group {shown(group)}" if group else str(path)
     with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
@@ -54,7 +54,7 @@ def open_hdf5(path: Path, group: str | None = None) -> LogColumns:
 
 
 def demonstrations(path: Path) -> list[str]:
-    """Groups of a file that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
+    """Names of the groups that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
     with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
         data: Any = file.get("data", ())
         names = [str(name) for name in data if str(name).startswith("demo_")]
@@ -71,7 +71,7 @@ def _group(file: h5py.File, group: str | None, path: Path) -> Any:
 
 
 def _control_rate(file: h5py.File) -> float | None:
-    """Hz of robomimic's rows: the controller's, in a text of JSON that describes the environment."""
+    """Hz of robomimic's rows: the control rate in the JSON text that describes the environment."""
     data = file.get("data")
     text = data.attrs.get("env_args") if isinstance(data, h5py.Group) else None
     try:

@@ -1,8 +1,8 @@
-"""Datasets of LeRobot, version 2 and 3, as columns: parquet files, and what they mean in meta/info.json.
+"""Reads datasets of LeRobot, versions 2 and 3, as columns: parquet files, which meta/info.json describes.
 
-The meta names the numbers of each vector and the rate.  It does not say whether angles are degrees or normalised to
--100 .. 100: LeRobot's `use_degrees` is not stored.  So the unit is taken from the numbers where they leave one
-possibility, and is asked for where they do not.
+The meta names the components of each vector and the rate.  It does not say whether angles are degrees or normalised to
+-100 .. 100, because LeRobot does not store its `use_degrees`.  The unit is inferred where the numbers can have only
+one; otherwise the user must state it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from droid_jax.recordings.table_file import scan_parquet
 
 VERSIONS = ("v2.", "v3.")
 COMMAND, POSITION, TIME = "action", "observation.state", "timestamp"
-NORMALISED = 100.5  # numbers beyond are none that LeRobot normalised
+NORMALISED_MAX = 100.5  # larger numbers are degrees: LeRobot normalises to -100 .. 100
 
 
 def open_dataset(path: Path, episode: int | None = None) -> LogColumns:
@@ -31,7 +31,7 @@ def open_dataset(path: Path, episode: int | None = None) -> LogColumns:
 
     Args:
         path: of the dataset's folder.
-        episode: its number; may be left out where there is one.
+        episode: its number; not needed where the dataset has a single episode.
 
     Raises:
         ValueError: the meta is damaged, of another version, or there is no such episode.
@@ -47,7 +47,7 @@ def open_dataset(path: Path, episode: int | None = None) -> LogColumns:
     have = np.unique(rows.select("episode_index").collect()["episode_index"].to_numpy())
     if episode is None and len(have) > 1:
         raise ValueError(
-            f"{path}: holds {len(have)} episodes, and several are repeats only where one motion was repeated: choose "
+            f"{path}: holds {len(have)} episodes, which are repeats only if they all replay one motion: choose "
             f"with --episodes, e.g. --episodes {have[0]}"
         )
     episode = int(have[0]) if episode is None and len(have) else episode
@@ -77,9 +77,9 @@ def read_info(path: Path) -> dict[str, Any]:
 
 
 def usual_map(log: LogColumns) -> ColumnMap:
-    """The map of a dataset: actions are commands, the state is the position; joints as the meta names them.
+    """The map of a dataset: actions are commands, the state is the position, the meta names the joints.
 
-    A gripper beside joints in degrees is left out: LeRobot logs it as a share of its travel, and that is not stored.
+    A gripper beside joints in degrees is left out: LeRobot logs it as a share of its travel, which is not stored.
     """
     if POSITION not in log.widths:
         raise ValueError(f"{log.where}: has no {POSITION!r}, the measured positions; it has: {named(log.widths)}")
@@ -89,7 +89,7 @@ def usual_map(log: LogColumns) -> ColumnMap:
             f"{log.where}: its meta does not name the {log.widths[POSITION]} joints of {POSITION!r}: give --joints"
         )
     joints = [name.removesuffix(POSE) for name in names]
-    if log.units.get(POSITION) == "deg":  # a gripper is logged as a share of its travel beside them
+    if log.units.get(POSITION) == "deg":
         joints = [joint for joint in joints if "gripper" not in joint]
     command = ChannelMap(COMMAND) if log.widths.get(COMMAND) == log.widths[POSITION] else None
     return ColumnMap(joints=joints, command=command, position=POSITION, time=TimeMap(TIME, "s"), units=Units())
@@ -106,15 +106,15 @@ def _components(feature: Any) -> tuple[str, ...]:
 
 
 def _units(log: LogColumns) -> tuple[dict[str, str], dict[str, str]]:
-    """Column -> unit where its numbers can have no other, and what they run between where they can."""
+    """Column -> unit where its numbers can have only one, and column -> hint for the user where not."""
     units, hints = dict[str, str](), dict[str, str]()
     both = [log.numbers(name) for name in (COMMAND, POSITION) if log.widths.get(name)]
     if not both:
         return units, hints
-    # Of joints that LeRobot normalises, a gripper is 0 .. 100 in either case.
+    # The largest number of all joints decides: a gripper's are 0 .. 100 in either case.
     size = max(float(np.nanmax(np.abs(numbers), initial=0.0)) for numbers in both)
     for name in (COMMAND, POSITION):
-        if size > NORMALISED:
+        if size > NORMALISED_MAX:
             units[name] = "deg"
         else:
             hints[name] = (

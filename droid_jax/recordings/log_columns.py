@@ -1,4 +1,4 @@
-"""Columns of a log by name, whatever file they come from, and the ones that a map means."""
+"""Columns of a log of any format by name, and those that a column map selects."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ POSE = ".pos"  # behind the name of a motor, in names of LeRobot's own robots
 class LogColumns:
     """The columns of one log, each read when it is asked for.
 
-    where: file and part of it, begins every message.
+    where: the file, or a part of it; begins every message.
     widths: name -> numbers per row; 0 for text and pictures, which are not read.
-    read: name -> [T] or [T, W].
+    read: name -> values [T] or [T, W].
     components: name of a column of vectors -> names of its W numbers.
-    units: what the log itself says: channel -> unit, and "time" -> unit.
-    hints: what the log tells of a unit that it does not state, by channel.
-    rate: Hz of the rows, where the log says it.
+    units: column -> unit, where the log states it.
+    hints: column -> sentence that helps to choose the unit, where the log does not state it.
+    rate: Hz of the rows, where the log states it.
     notes: for `meta` of the recording.
     """
 
@@ -52,15 +52,15 @@ class LogColumns:
         return True
 
     def pick(self, columns: str | Sequence[str], joints: Sequence[str], what: str) -> np.ndarray:
-        """[T, C] float64 of the columns that a map names, one for each joint.
+        """The numbers of a map's columns, one for each joint: [T, C], float64.
 
         Args:
             columns: as in `ChannelMap`.
             joints: C names, in the order wanted.
-            what: they are, for messages.
+            what: name of the channel, for messages.
 
         Raises:
-            ValueError: a column is not there, is no column of numbers, or there are more or fewer than joints.
+            ValueError: a column is missing or holds no numbers, or there are not as many numbers in a row as joints.
         """
         parts = []
         if isinstance(columns, str) and (by_name := self._by_name(columns, joints)) is not None:
@@ -80,16 +80,16 @@ class LogColumns:
         return picked
 
     def stated(self, columns: str | Sequence[str], of: Mapping[str, str]) -> str | None:
-        """What `units` or `hints` say of the columns that a map names; None where they say nothing."""
+        """The entry of `units` or `hints` for the columns of a map; None where there is none."""
         for text in as_list(columns):
             for name in (name for name in of if text == name or text.startswith((f"{name}.", f"{name}["))):
                 return of[name]
         return None
 
     def numbers(self, name: str) -> np.ndarray:
-        """[T] or [T, W] of a column in the type that it has, [T] also of [T, 1], as MATLAB writes vectors.
+        """The numbers of a column, [T] or [T, W], in its own type; [T, 1], as MATLAB writes vectors, becomes [T].
 
-        ValueError where it is not there or no numbers.
+        ValueError where the column is missing or holds no numbers.
         """
         if name not in self.widths:
             raise ValueError(f"{self.where}: no column {shown(name)}; it has: {named(self.widths) or 'none'}")
@@ -99,7 +99,7 @@ class LogColumns:
         return numbers[:, 0] if numbers.ndim == 2 and numbers.shape[1] == 1 else numbers
 
     def _by_name(self, name: str, joints: Sequence[str]) -> list[str] | None:
-        """Columns of a vector's components that are named as the joints; None where one is not."""
+        """The vector's components that have the joints' names, as columns; None where a joint has none."""
         known = {part.removesuffix(POSE): f"{name}.{part}" for part in self.components.get(name, ())}
         found = [known.get(joint.removesuffix(POSE)) for joint in joints]
         return None if None in found or not found else [text for text in found if text is not None]
@@ -107,7 +107,7 @@ class LogColumns:
     def _found(
         self, columns: str | Sequence[str], joints: Sequence[str], what: str
     ) -> list[tuple[str, list[int] | None]]:
-        """(column, components of it) for every number that a map names; None: all of them."""
+        """(column, components) for every column of a map; None as components means all of them."""
         found: list[tuple[str, list[int] | None]] = []
         for text in as_list(columns):
             if _NUMBER in text and text not in self.widths:
@@ -139,23 +139,23 @@ class LogColumns:
 
 
 def width_of(shape: Sequence[int]) -> int:
-    """Numbers in a row of an array [T] or [T, W]; 0 of any other, which is no column."""
+    """Numbers in a row of an array of that shape, [T] or [T, W]; 0 for any other shape, which is no column."""
     return {1: 1, 2: shape[-1] if shape else 0}.get(len(shape), 0)
 
 
 @contextlib.contextmanager
 def readable(where: Path | str, what: str) -> Iterator[None]:
-    """Errors of a library that reads a file, as a ValueError that names it: damaged files raise a dozen kinds.
+    """Turns every error of a library that reads a file into a ValueError that names the file.
 
     Args:
-        where: the file, or a part of it; errors that begin with it are ours and go on.
-        what: it should be, "HDF5 file".
+        where: the file, or a part of it; a ValueError that begins with it is raised unchanged.
+        what: kind of the file, "HDF5 file".
     """
     try:
         yield
     except (KeyboardInterrupt, SystemExit, FileNotFoundError, PermissionError):
         raise
-    except BaseException as error:  # polars' panics are no Exception
+    except BaseException as error:  # damaged files raise many types; polars' panics are no Exception
         if isinstance(error, ValueError) and str(error).startswith(str(where)):
             raise
         why = said(error) or type(error).__name__

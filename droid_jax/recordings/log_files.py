@@ -1,4 +1,4 @@
-"""Logs of any column names: which reader opens a file, and which map it is read by."""
+"""Reads logs of any column names: chooses the reader of a file and the column map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SUFFIXES = (*TABLES, *PARQUET, *HDF5, *NPZ, *TORCH)
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether a path is the folder of a LeRobot dataset; asked without the package that reads one."""
+    """Whether a path is the folder of a LeRobot dataset; needs no optional package."""
     return path.is_dir() and (path / INFO).is_file()
 
 
@@ -39,7 +39,7 @@ def is_log(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether an npz file is a recording of this program, of another version, or so damaged that it may be one."""
+    """Whether an npz file is a recording of this or another version, or so damaged that it may be one."""
     try:
         with NpzFile(path) as file:
             return "format" in file or "metadata" in file
@@ -66,21 +66,21 @@ def read_log(
 
     Args:
         paths: files, or folders.
-        columns: their map, its file, or the name of a layout.  Without one, it is a map in the folder `beside` that
-            names columns which the first log has, or the layout of a format that it is of.
-        episodes: of a LeRobot dataset, their numbers; of an HDF5 file, the groups: each is one repeat.
-        channels, units, changes: in place of what the map says, as in `changed_map`.
-        beside: folder in which maps of earlier logs are looked for.
+        columns: their map, its file, or the name of a layout.  By default a map in the folder `beside` whose columns
+            the first log has, or the layout of the log's format.
+        episodes: of a LeRobot dataset, their numbers; of an HDF5 file, the groups.  Each is one repeat.
+        channels, units, changes: replace entries of the map, as in `changed_map`.
+        beside: folder that is searched for maps of earlier logs.
         name: of the recording; the first log's by default.
         command_tolerance, phases, allow_jitter: as in `read_logs`.
-        torque_constant: of torques that are currents, in place of the map's; others are multiplied with it.
+        torque_constant: N m (N) per unit of the log.  Replaces the map's; torques without one are multiplied by it.
 
     Returns:
-        The recording, the map it was read by, and where that is from.
+        The recording, the map it was read with, and where that map is from.
 
     Raises:
-        FileNotFoundError: a log is not there.
-        ValueError: something in it is not as it should be, or no map is given and none is known.
+        FileNotFoundError: a log does not exist.
+        ValueError: a log does not fit its map or makes no valid recording, or no map is given and none is known.
     """
     paths = [path_of(path, "the path of a log") for path in paths]
     for path in paths:
@@ -99,7 +99,7 @@ def read_log(
         found, origin = read_map(columns), str(columns)
     if found is None and not channels:
         raise ValueError(
-            f"{paths[0]}: does not say which of its columns are what: give a map, --map FILE.toml, or --columns "
+            f"{paths[0]}: does not say what its columns are: give a map, --map FILE.toml, or --columns "
             f"position=... command=... time=... (docs/file-formats.md); it has: {_columns_of(paths[0], logs[0])}"
         )
     found = changed_map(found, channels or {}, units or {}, torque_constant, **changes)
@@ -114,7 +114,7 @@ def read_log(
         allow_jitter=allow_jitter,
     )
     entry = found.channel("torque")
-    if torque_constant and (entry is None or entry.torque_constant is None):  # otherwise the map has counted it
+    if torque_constant and (entry is None or entry.torque_constant is None):  # otherwise it is applied with the map
         recording = with_torque_constants(recording, torque_constant)
     return recording, found, origin or "--columns"
 
@@ -122,11 +122,12 @@ def read_log(
 def _known_map(
     log: Opened, path: Path, beside: Path | None, changed: Callable[[ColumnMap], ColumnMap]
 ) -> tuple[ColumnMap | None, str]:
-    """A map that a log without one can be read by, and where it is from; changed: what the caller makes of it, so that
-    maps are alike which differ in nothing else.
+    """A known map that fits a log, and where it is from; (None, "") where there is none.
+
+    changed: applies the caller's changes; two maps that are equal after them count as one.
     """
     near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
-    # Gains are of one log: a map that still has some is of an earlier version, or its author's.
+    # Gains belong to one log.  Maps that hold some were written by hand or by an earlier version.
     maps = {file: msgspec.structs.replace(read_map(file), stiffness=[], damping=[]) for file in near}
     kept = {file: columns for file, columns in maps.items() if fits(log, columns)}
     if kept:
@@ -140,7 +141,7 @@ def _known_map(
         return _reader("lerobot").usual_map(log(None)), "its meta"
     for name in layouts():
         columns = read_map(name)
-        # A layout without joints fits by its columns; the joints are asked for.
+        # A layout without joints is compared by its columns only; the user has to name the joints.
         probe = columns if columns.joints else changed_map(columns, {}, {}, joints=_as_many(log, columns))
         if fits(log, probe):
             return columns, f"the layout {name!r}"
@@ -148,7 +149,7 @@ def _known_map(
 
 
 def _alike(one: ColumnMap, other: ColumnMap) -> bool:
-    """Whether two maps read the same numbers, be it onto clocks of another rate."""
+    """Whether two maps read the same numbers, possibly at different rates."""
     rate = one.rate if one.stamps is None else None
     return msgspec.structs.replace(one, rate=rate) == msgspec.structs.replace(
         other, rate=other.rate if other.stamps is None else None
@@ -156,7 +157,7 @@ def _alike(one: ColumnMap, other: ColumnMap) -> bool:
 
 
 def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
-    """The joints that a log itself names for the positions, velocities or torques of a map."""
+    """The joint names that a log states for the positions, velocities or torques of a map."""
     for key in ("position", "velocity", "torque"):
         if (entry := columns.channel(key)) is not None and isinstance(entry.columns, str):
             return log(entry.file).components.get(entry.columns, ())
@@ -164,7 +165,7 @@ def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
 
 
 def _as_many(log: Opened, columns: ColumnMap) -> tuple[str, ...]:
-    """Names for as many joints as a layout's positions have."""
+    """Numbered names, as many as the layout's position column has numbers."""
     entry = columns.channel("position")
     width = 0 if entry is None else log(None).widths.get(str(entry.columns), 0)
     return tuple(str(i) for i in range(width))
@@ -177,7 +178,7 @@ def _columns_of(path: Path, log: Opened) -> str:
 
 
 def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
-    """What opens each repeat of a path."""
+    """For each repeat at a path, the function that opens its files."""
     if is_dataset(path):
         numbers = [_number(path, e) for e in episodes] or [None]
         return [_once(partial(_dataset, path, number)) for number in numbers]
@@ -186,8 +187,8 @@ def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
         found = reader.demonstrations(path)
         if not episodes and len(found) > 1:
             raise ValueError(
-                f"{path}: holds {len(found)} demonstrations, which are repeats only where one motion was "
-                f"repeated: choose with --episodes, e.g. --episodes {found[0]}"
+                f"{path}: holds {len(found)} demonstrations, which are repeats only if they all replay one "
+                f"motion: choose with --episodes, e.g. --episodes {found[0]}"
             )
         chosen = [str(e) for e in episodes] or found or [None]
         return [_once(partial(_alone, path, partial(reader.open_hdf5, path, group))) for group in chosen]
@@ -199,7 +200,7 @@ def _parts(path: Path, episodes: Sequence[str | int]) -> list[Opened]:
 
 
 def _once(opened: Opened) -> Opened:
-    """The same, each file opened once."""
+    """The same function, which opens each file only once."""
     return lru_cache(maxsize=None)(opened)
 
 
@@ -223,7 +224,7 @@ def _alone(path: Path, opened: Callable[[], LogColumns], file: str | None = None
 
 
 def _inside(path: Path, file: str | None = None) -> LogColumns:
-    """One file of a folder, by the name that the map has for it."""
+    """One file of a folder, by its name in the map (with `*`)."""
     have = sorted(p.name for p in path.iterdir())
     if file is None:
         raise ValueError(f"{path}: is a folder: give one of its files, or a map that names them (file = ...)")
@@ -237,7 +238,7 @@ def _inside(path: Path, file: str | None = None) -> LogColumns:
 
 
 def open_file(path: Path) -> LogColumns:
-    """The columns of a file, by its suffix; ValueError where it is of none of SUFFIXES, or damaged."""
+    """The columns of a file with one of SUFFIXES; ValueError for another suffix or a damaged file."""
     if path.name.endswith(TABLES):
         return _reader("table_file").open_csv(path)
     if path.name.endswith(PARQUET):
@@ -252,7 +253,7 @@ def open_file(path: Path) -> LogColumns:
 
 
 def open_npz(path: Path) -> LogColumns:
-    """The arrays of an npz file of any names; ValueError where it is damaged."""
+    """The arrays of any npz file; ValueError where it is damaged."""
     with NpzFile(path) as file:
         widths = {name: width_of(file.shape(name) or ()) for name in file.names}
 
@@ -271,7 +272,7 @@ _NEEDS = {
 
 
 def _reader(module: str) -> Any:
-    """A module that needs a package of its own, imported where it is used."""
+    """A reader module, imported on use; ValueError where its package is not installed."""
     if module in _NEEDS:
         what, package = _NEEDS[module]
         needs(what, "formats", package)

@@ -1,4 +1,4 @@
-"""Numbers of a log in the units of a recording: what a map, or the log itself, says of them."""
+"""Converts numbers of a log to the units of a recording, from the units that the map or the log states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,19 @@ from droid_jax.recordings.units import COUNTS, CURRENTS, HINGES, KINDS, NORMALIS
 def in_si(
     numbers: np.ndarray, entry: ChannelMap, key: str, joints: Sequence[str], columns: ColumnMap, log: LogColumns
 ) -> np.ndarray:
-    """[T, C] in the units of a recording."""
+    """Numbers [T, C] of a log in the units of a recording.
+
+    Args:
+        numbers: [T, C] as the log has them.
+        entry: the map's entry of the channel.
+        key: name of the channel.
+        joints: C names.
+        columns: the whole map.
+        log: the log, which may state units itself.
+
+    Raises:
+        ValueError: a unit is unknown or not stated, or a number that its conversion needs is missing.
+    """
     where = f"{log.where}, {key}"
     units = _unit_of_each(entry, key, joints, columns, log)
     pairs = zip(units, joints, strict=True)
@@ -48,7 +60,7 @@ def in_si(
 
 
 def _unit_of_each(entry: ChannelMap, key: str, joints: Sequence[str], columns: ColumnMap, log: LogColumns) -> list[str]:
-    """The unit of each column: the channel's own, that of all channels, or what the log says."""
+    """The unit of each column: that of the map's entry, else that of the whole map, else that which the log states."""
     if isinstance(entry.unit, list):
         if len(entry.unit) != len(joints):
             raise ValueError(f"{log.where}, {key}: {len(entry.unit)} units for {len(joints)} joints")
@@ -83,11 +95,11 @@ def _each(value: float | list[float], count: int, where: str) -> np.ndarray:
 
 
 def _range(entry: ChannelMap, count: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest position [C] of joints that are logged as shares of their travel."""
+    """Lowest and highest position, each [C], of joints that are logged as shares of their travel."""
     if not entry.range:
         raise ValueError(
-            f"{where}: range is needed for a normalised position: [lowest, highest] of each joint in rad (m), as it "
-            "was calibrated"
+            f"{where}: range is needed for a normalised position: the calibrated [lowest, highest] of each "
+            "joint in rad (m)"
         )
     ends = np.array([entry.range] if not isinstance(entry.range[0], list) else entry.range, np.float64, ndmin=2)
     if ends.ndim != 2 or ends.shape[1] != 2 or len(ends) not in (1, count) or not np.all(ends[:, 0] < ends[:, 1]):

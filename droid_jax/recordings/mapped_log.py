@@ -1,4 +1,4 @@
-"""Recordings out of logs of any column names, by a `ColumnMap`: one log, or one part of it, for each repeat."""
+"""Reads recordings from logs of any column names with a `ColumnMap`: one log, or one part of it, for each repeat."""
 
 from __future__ import annotations
 
@@ -52,16 +52,16 @@ def read_logs(
     clocks; with a rate and a column of time in the map, all are interpolated onto one.
 
     Args:
-        logs: of each repeat, what opens its files.
-        columns: what their columns are.
+        logs: for each repeat, the function that opens its files.
+        columns: their column map.
         name: of the recording.
         command_tolerance: rad or m by which the commands of repeats may differ.
         phases: named parts of the motion, s from its beginning.
         allow_jitter: accept clocks of an irregular rate.
 
     Raises:
-        ValueError: a column is missing or has other numbers than the map says, a unit is not stated, time is not
-            finite, does not increase or has no clear unit, or the repeats hold different commands.
+        ValueError: a column is missing or does not fit the map, a unit is not stated, time is not finite, does not
+            increase or has no clear unit, or the repeats have different commands.
     """
     repeats = [_read(opened, columns, allow_jitter) for opened in logs]
     places = [_first(opened, columns).where for opened in logs]
@@ -88,8 +88,8 @@ def read_logs(
         phases=tuple(phases),
         meta=_meta(places, _first(logs[0], columns), columns),
     )
-    # A state log may begin long before the first command, from which the replay starts; or after it, and then it does
-    # not tell the start.
+    # The replay starts at the first command.  Measurements may begin long before it, or after it; in the latter case
+    # the initial position is unknown.
     first, begun = start_positions(channels), recording.measured_start()
     known = begun if commands else {**first, **begun}
     qpos0 = {joint: known[joint] for joint in first if joint in known}
@@ -143,7 +143,7 @@ def _read(opened: Opened, columns: ColumnMap, allow_jitter: bool) -> dict[str, _
 
 
 def _powered(opened: Opened, columns: ColumnMap, found: dict[str, _Series]) -> dict[str, _Series]:
-    """What was recorded in the longest stretch in which the motors are on; a warning says what is left out."""
+    """The part of all channels in the longest interval with motors on; a warning states the interval."""
     key = "command" if "command" in found else next(iter(found))
     entry, clock = columns.channel(key), found[key].time
     assert entry is not None and columns.powered is not None
@@ -160,7 +160,7 @@ def _powered(opened: Opened, columns: ColumnMap, found: dict[str, _Series]) -> d
     low, high = clock[first], clock[end - 1]
     warnings.warn(
         f"{log.where}: the motors are off in {np.mean(~on):.0%} of the rows ({shown(columns.powered)}); read is "
-        f"{low - clock[0]:.3g} to {high - clock[0]:.3g} s, the longest stretch in which they are on",
+        f"{low - clock[0]:.3g} to {high - clock[0]:.3g} s, the longest interval in which they are on",
         stacklevel=4,
     )
     return {
@@ -189,7 +189,7 @@ def _stamps(columns: ColumnMap, entry: ChannelMap) -> TimeMap | None:
 
 
 def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: int, allow_jitter: bool) -> np.ndarray:
-    """[T] s of one file's rows, since the epoch that it has; of a file without stamps by the rate of its rows."""
+    """Instants [T] s of one file's rows, since the file's epoch; without stamps, by the rate of the rows."""
     if stamps is None:
         rate = rate or log.rate
         if rate is None:
@@ -206,7 +206,8 @@ def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: in
             raise ValueError(f"{log.where}, time: column {shown(name)} has {numbers.shape[1]} numbers in a row")
         if (bad := np.flatnonzero(~np.isfinite(numbers))).size:
             raise ValueError(f"{log.where}, time, row {bad[0]}: expected a number, got {numbers[bad[0]]}")
-        # Whole numbers are subtracted as such: nanoseconds since 1970 do not fit a float64.  Unsigned ones wrap.
+        # Integers are subtracted before they become float64, which cannot hold nanoseconds since 1970.  Unsigned
+        # integers would wrap.
         if numbers.dtype.kind == "u":
             numbers = numbers.astype(np.int64)
         parts.append((numbers, TIMES[unit or _usual_unit(numbers, f"{log.where}, time {shown(name)}")]))
@@ -214,18 +215,18 @@ def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: in
     regular = allow_jitter or rate is not None
     remedy = "where the rows have one rate, a map with that rate (--rate) and without time reads them by their number"
     check_clock(time, f"{log.where}, time", allow_jitter=regular, remedy=remedy)
-    # Several files of one log share an epoch: what was subtracted is added again, as far as a float64 holds it.
+    # Several files of one log share an epoch, so the first stamp is added again, to the precision of a float64.
     return time + sum(float(n[0]) * scale for n, scale in parts)
 
 
 def _usual_unit(numbers: np.ndarray, where: str) -> str:
-    """Seconds where the steps can be some; ValueError says what they may be instead."""
+    """The unit "s" where the steps are plausible in seconds; ValueError lists the units that are plausible instead."""
     if len(numbers) < 2:
         return "s"
     step = abs(float(np.median(np.diff(numbers.astype(np.float64)))))
     possible = [unit for unit, scale in TIMES.items() if 2e-5 <= step * scale <= 0.2]
     if possible == ["s"] or not possible or step == 0:
-        return "s"  # what is wrong with it otherwise is said where the clock is checked
+        return "s"  # `check_clock` reports what else may be wrong
     said = " or ".join(f'"{unit}" ({1 / (step * TIMES[unit]):.4g} Hz)' for unit in possible)
     if "s" in possible and float(np.ptp(numbers.astype(np.float64))) >= 1.0:
         return "s"
@@ -237,7 +238,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _on_one_clock(repeats: list[dict[str, _Series]], rate: float, places: Sequence[str]) -> list[dict[str, _Series]]:
-    """All channels of all repeats on one uniform clock over the part that they cover."""
+    """All channels of all repeats, interpolated onto one uniform clock over the part that all repeats cover."""
     measured = [next(s for key, s in repeat.items() if key != "command") for repeat in repeats]
     clock = common_clock([s.time for s in measured], rate, places)
     out = []

@@ -1,4 +1,4 @@
-"""What both formats store beside the arrays of a recording, as JSON: the text of a recording.json."""
+"""A recording without its arrays, as JSON: the text of a recording.json, which both formats store."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FORMAT = "droid_jax recording 1"
 
 @dataclass(frozen=True)
 class Metadata:
-    """What both formats store beside the arrays of command and channels."""
+    """The fields of a recording without the arrays of command and channels."""
 
     name: str
     commands: bool
@@ -124,7 +124,12 @@ def _floats(array: np.ndarray) -> list[Any]:
 def metadata_from_json(text: str, where: str) -> Metadata:
     """The metadata in the text of a recording.json.
 
-    where: what the text belongs to.  ValueError names the key that is unknown, missing or of the wrong kind.
+    Args:
+        text: content of the file.
+        where: the file, for messages.
+
+    Raises:
+        ValueError: a key is unknown, missing or of the wrong kind; the message names it.
     """
     raw = parse_json(text, where)
     if isinstance(raw, dict) and raw.get("format", FORMAT) != FORMAT:

@@ -14,11 +14,11 @@ from droid_jax.recordings.metadata import FORMAT, metadata_from_json, metadata_t
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.storage import write_npz
 
-KIND = "droid_jax recording"  # FORMAT of any version
+KIND = "droid_jax recording"  # begins FORMAT in every version
 
 
 def save_npz(recording: Recording, path: Path) -> None:
-    """Write a recording, which is taken to be valid."""
+    """Write a valid recording."""
     arrays = {
         "format": np.array(FORMAT),
         "metadata": np.array(metadata_to_json(recording)),
@@ -31,11 +31,11 @@ def save_npz(recording: Recording, path: Path) -> None:
 
 
 def is_npz(path: Path) -> bool:
-    """Whether a file is a recording of this program, or what damage left of one; reads a few kB at most."""
+    """Whether a file is a recording of this program, possibly a damaged one; reads a few kB at most."""
     try:
         with path.open("rb") as file:
             head = file.read(40)
-        if not zipfile.is_zipfile(path):  # cut off: its first member's name is left
+        if not zipfile.is_zipfile(path):  # cut off: only the first member's name identifies it
             return head.startswith(b"PK\x03\x04") and head.endswith(b"format.npy")
         with zipfile.ZipFile(path) as members, members.open("format.npy") as member:
             return KIND.encode("utf-32-le") in member.read(4096)  # numpy's text

@@ -1,9 +1,8 @@
 """A demonstration and its measured repeats: `Recording`.
 
-One motion is commanded once per repeat; the command is the same each time, the measurements
-differ.  Every channel keeps its own clock, so a door angle filmed at 30 Hz can stand beside
-torques at 1 kHz.  What was not measured is masked, never filled in.  `recordings.checks` says what
-a recording must fulfil.
+One motion is commanded once per repeat.  The command is the same in all repeats; the measurements differ.  Every
+channel keeps its own clock, so that a recording can hold a door angle filmed at 30 Hz and torques at 1 kHz.  Values
+that were not measured are masked, never filled in.  `recordings.checks` validates recordings.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ import numpy as np
 from droid_jax.arguments import check_fields, choice, flag, is_list, mapping, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
-START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
+LATEST_START = 0.1  # s after the first command: the initial position is that of a channel which begins by then
 JOINT_CHANNELS = ("torque", "position", "velocity")  # channels whose columns are robot joints
-POSITION_CHANNELS = ("position", "object_angle")  # channels that say where a joint is
+POSITION_CHANNELS = ("position", "object_angle")  # channels of joint positions
 
 
 class TorqueSide(enum.Enum):
-    """Where a torque was measured: armature, damping and motor friction lie in between."""
+    """Where a torque was measured; armature, damping and motor friction act between the two sides."""
 
     MOTOR = "motor"  # what the motor produces (MuJoCo's qfrc_actuator, a motor current)
     LINK = "link"  # what arrives behind the gear (a joint torque sensor, a Panda's tau_J)
@@ -85,7 +84,7 @@ class ServoGains:
     """The position servo's gains, one per command column.
 
     stiffness: [U] N m/rad (N/m for slides).
-    damping: [U] N m s/rad (N s/m for slides); None where it is not known: a replay has the scene's.
+    damping: [U] N m s/rad (N s/m for slides); None where it is not known, so that a replay uses the scene's.
     """
 
     stiffness: np.ndarray
@@ -94,7 +93,7 @@ class ServoGains:
 
 @dataclass(frozen=True, eq=False)
 class ObjectPose:
-    """Where the object stands in the robot's base frame, and how well that is known.
+    """Pose of the object in the robot's base frame, and its uncertainty.
 
     position: [3] m; quaternion: [4] unit, w x y z; covariance: [6, 6] in m and rad.
     """
@@ -115,12 +114,11 @@ class Recording:
         command_names: U joint names.
         channels: name -> Channel; all share N.
         torque: what the torque channel holds.
-        qpos0: joint name -> position at the start, rad or m; joints not named start where they were first
-            measured, else at their first command, else where the scene has them.
+        qpos0: joint name -> position at the start, rad or m. Joints not named start at their first measured
+            position, else at their first command, else at the scene's position.
         gains: servo gains, when known.
-        known: parameter name -> its value in this recording, in the parameter's unit, where set-ups differ in what is
-            known (a payload that was weighed); or the name of the parameter that stands for it here. The replay takes
-            it whatever is fitted.
+        known: parameter name -> known value in this recording, in the parameter's unit (a payload that was weighed);
+            or -> name of the parameter to use in its place. The replay uses it whatever is fitted.
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.
         meta: free notes; not part of the content hash.
@@ -162,8 +160,8 @@ class Recording:
     def sha256(self) -> str:
         """Hash of arrays, names, units and conventions, the same from every file format.
 
-        Numbers enter as float64 and masked-out values as zero, so neither the stored
-        precision nor what stands in an unmeasured cell changes it.
+        Numbers enter as float64 and masked-out values as zero.  The stored precision and the numbers in unmeasured
+        cells therefore do not change the hash.
         """
         head, arrays = _content(self)
         digest = hashlib.sha256(json.dumps(head, sort_keys=True).encode())
@@ -181,7 +179,7 @@ class Recording:
 
     @property
     def grip_window(self) -> tuple[float, float] | None:
-        """s, from the end of phase "grasp" to the beginning of "release", or the last command; None without a grasp."""
+        """From the end of phase "grasp" to the beginning of "release" or the last command, s; None without a grasp."""
         named = {p.name: p for p in self.phases}
         if "grasp" not in named:
             return None
@@ -191,12 +189,13 @@ class Recording:
     def measured_start(self) -> dict[str, float]:
         """Joint -> measured position at the beginning of the motion, rad or m, mean over the repeats."""
         first = float(self.time[0]) if len(self.time) else self.span[0]
-        return _measured_at(self, first, START)
+        return _measured_at(self, first, LATEST_START)
 
     def repeats_subset(self, indices: Sequence[int]) -> Recording:
-        """A copy that holds these repeats only (training against held-out repeats).
+        """A copy with these repeats only, as for training or held-out repeats.
 
-        Raises ValueError when no index is given or one lies outside 0 .. N - 1.
+        Raises:
+            ValueError: no index is given, or one lies outside 0 .. N - 1.
         """
         if not is_list(indices):
             raise ValueError(f"repeats must be a list of whole numbers, got {shown(indices)}")
@@ -208,12 +207,16 @@ class Recording:
         return replace(self, channels=channels)
 
     def window(self, start: float, end: float, *, qpos0: Mapping[str, float] | None = None) -> Recording:
-        """The part from start to end (s, both included); clocks keep their numbers.
+        """The part from start to end (s, both included); instants keep their values.
 
-        A window that begins later than the recording needs new initial positions: those given
-        as qpos0 first, then the measured ones (mean over repeats).  Raises ValueError when the
-        window is empty for the command or a channel, or a joint's position at its beginning is
-        neither given nor measured.
+        Args:
+            start, end: s.
+            qpos0: initial positions of the window, rad or m.  Joints that are not named take the measured position
+                at the start (mean over repeats).
+
+        Raises:
+            ValueError: the window is empty for the command or a channel, or a joint's position at its start is neither
+                given nor measured.
         """
         start, end = number(start, "start of a window"), number(end, "end of a window")
         if qpos0 is not None:
@@ -246,7 +249,7 @@ class Recording:
 
 
 def recordings_of(given: Any) -> tuple[Recording, ...]:
-    """One recording or several as a tuple; ValueError where there is none, or a file's name stands for its content."""
+    """One recording or several as a tuple; ValueError where there is none, or where file names are given instead."""
     if isinstance(given, Recording):
         return (given,)
     if not is_list(given):
@@ -261,7 +264,7 @@ def recordings_of(given: Any) -> tuple[Recording, ...]:
 
 
 def _rows(time: np.ndarray, start: float, end: float) -> np.ndarray:
-    """[T] bool, which instants lie in the window."""
+    """Whether each instant lies in the window, [T] bool."""
     return (time >= start - SLACK) & (time <= end + SLACK)
 
 
@@ -272,8 +275,8 @@ def _outside(what: str, time: np.ndarray, start: float, end: float) -> str:
 def _positions_at(recording: Recording, start: float, given: Mapping[str, float]) -> dict[str, float]:
     """Joint positions at an instant, for the joints of qpos0 and those given.
 
-    Of a log joints of which nothing was measured are taken to stand still, and those of which something was, but not
-    there, are left out.
+    In a log without commands, joints that were never measured are assumed to stand still.  Joints that were measured,
+    but not at this instant, are left out.
     """
     first = float(recording.time[0]) if len(recording.time) else recording.span[0]
     if start <= first + SLACK:
@@ -299,7 +302,7 @@ def _measured_at(recording: Recording, instant: float, slack: float = SLACK) -> 
         for c, joint in enumerate(channel.columns):
             found = [_interpolate(channel, r, c, instant, slack) for r in range(recording.repeats)]
             found = [v for v in found if v is not None]
-            if found and joint not in measured:  # a joint's own sensor before a camera
+            if found and joint not in measured:  # prefers the joint's own sensor to a camera
                 measured[joint] = float(np.mean(found))
     return measured
 
@@ -320,7 +323,7 @@ def known_values(recording: Recording) -> dict[str, float | str]:
 
 
 def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]]:
-    """What the hash covers: a JSON head, and little-endian arrays in a fixed order."""
+    """The content that is hashed: a JSON head, and little-endian arrays in a fixed order."""
     pose, gains = recording.object_pose, recording.gains
     names = sorted(recording.channels)
     head: dict[str, Any] = {
@@ -339,7 +342,7 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
         if pose is None
         else [_numbers(a) for a in (pose.position, pose.quaternion, pose.covariance)],
     }
-    if recording.known:  # absent in recordings from before there was such a thing
+    if recording.known:  # left out when empty, so that hashes of older recordings stay the same
         head["known"] = known_values(recording)
 
     def arrays() -> Iterator[np.ndarray]:

@@ -1,10 +1,9 @@
 """Recordings from ROS bags: one bag per repeat, ROS 1 or ROS 2.
 
-The joint state topic gives torque (effort), position and velocity; an optional command topic
-gives the position command.  Every bag starts at its first command (at its first joint state
-when there is no command topic), and all are interpolated onto one uniform clock.  Repeats are in
-the order in which they were recorded.  Nothing is invented: samples that fall into a gap of the
-log are masked out.
+The joint state topic gives torque (effort), position and velocity; an optional command topic gives the position
+command.  Every bag starts at its first command, or without a command topic at its first joint state.  All bags are
+interpolated onto one uniform clock.  Repeats are in the order in which they were recorded.  Samples that fall into a
+gap of the log are masked.
 """
 
 from __future__ import annotations
@@ -27,17 +26,19 @@ from droid_jax.recordings.recording import Channel, Phase, Recording, ServoGains
 
 
 class Stamps(enum.Enum):
-    """Which time stamp of a message counts."""
+    """Which time stamp of a message is used."""
 
     AUTO = "auto"  # header stamps where all messages used have one, else BAG
     HEADER = "header"  # when the message was made
     BAG = "bag"  # when the recorder received it
 
 
-STATE, COMMAND = "state", "command"  # keys of what is read of a bag
-UNUSED = "unused_setpoints"  # in `meta`: what the commands held beside positions
-DRIFT = 0.03  # s by which a log at its nominal rate may be off at its end unremarked
-NEAR = 0.05  # relative deviation within which a stated rate is meant to be that of the stamps
+STATE, COMMAND = "state", "command"  # keys of the two topics that are read from a bag
+UNUSED_SETPOINTS = (
+    "unused_setpoints"  # in `meta`: kinds of set-points that the commands hold and the recording does not
+)
+LARGEST_DRIFT = 0.03  # s at the end of the log, if its samples were at --rate; a larger drift gives a warning
+SAME_RATE = 0.05  # largest relative difference at which --rate is taken to mean the rate of the stamps
 _Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
 
 
@@ -66,29 +67,32 @@ def read_bags(
 
     The repeats are in the order of recording, or in that of `paths` where the bags' times overlap.
 
-    joints:            measured joints, in the order wanted; a mapping gives each one's name in the messages.
-    slides:            those of them that slide; a bag does not say.
-    torque:            what the efforts are; a bag does not say.  None: they are not read.
-    state_topic:       of a type in `bag_messages.STATES`.
-    command_topic:     of a type in `bag_messages.COMMANDS`; of a controller's state, the reference
-                       counts.  None reads a log without commands.  It may be the state topic, where
-                       a message holds both.
-    command_joints:    commanded joints, and the order of numbers in messages without names;
-                       `joints` by default.  A mapping as there.
-    motors:            places of the joints in messages without names that hold more of them, from 0.
-    velocity_actuators, effort_actuators: names in the MJCF of the actuators, one per commanded joint,
-                       that take the commands' set-points of velocity and effort.
-    rate:              Hz of the common clock; the usual rate of the first bag's joint states
-                       by default.
-    stamps:            which time stamps count.
-    command_tolerance: rad or m by which the repeats' commands may differ (jitter of arrival).
-    qpos0:             initial positions to add to, or put in place of, the measured ones.
-    gains, phases:     passed on; phases count from each bag's start.
-    allow_jitter:      accept stamps at an irregular rate.
+    Args:
+        paths: the bags.
+        joints: measured joints, in the order wanted; a mapping gives each joint's name in the messages.
+        slides: those of the joints that slide, which a bag does not state.
+        torque: convention of the efforts, which a bag does not state; None: efforts are not read.
+        state_topic: its messages are of a type in `bag_messages.STATES`.
+        command_topic: its messages are of a type in `bag_messages.COMMANDS`.  From the state of a controller, the
+            reference is read.  None for a log without commands.  It may be the state topic, where messages hold both.
+        command_joints: commanded joints, in the order of the numbers in messages without names; a mapping gives names
+            in the messages.  `joints` by default.
+        motors: positions of the joints, from 0, in messages without names that hold more numbers than joints.
+        velocity_actuators, effort_actuators: names in the MJCF of the actuators, one per commanded joint, that take
+            the commands' set-points of velocity and effort.
+        rate: Hz of the common clock; by default that of the median step of the first bag's joint states.
+        stamps: which time stamps are used.
+        command_tolerance: rad or m by which the repeats' commands may differ (jitter of arrival).
+        name: of the recording; by default that of the first bag's file.
+        qpos0: initial positions, rad or m, that replace the measured ones.
+        gains: servo gains of the recording; by default those that the commands themselves state.
+        phases: named parts of the motion, s from each bag's start.
+        allow_jitter: accept stamps at an irregular rate.
 
-    Raises FileNotFoundError for a missing bag and ValueError, naming the bag, for a missing
-    topic or joint, a topic without messages, efforts that are not finite, stamps that do not
-    increase, commands that differ between repeats, or bags without a common part.
+    Raises:
+        FileNotFoundError: a bag does not exist.
+        ValueError: a topic or joint is missing, a topic has no messages, efforts are not finite, stamps do not
+            increase, commands differ between repeats, or the bags have no common part.  The message names the bag.
     """
     bags = _bags(paths)
     sent = joints if command_joints is None else command_joints
@@ -131,7 +135,7 @@ def read_bags(
             "stamps": "header" if use_header else "bag",
             "state_topic": state_topic,
             "command_topic": command_topic or "",
-            **({UNUSED: ", ".join(unused)} if unused else {}),
+            **({UNUSED_SETPOINTS: ", ".join(unused)} if unused else {}),
         },
     )
     return validate(recording, source=", ".join(str(bag) for bag in bags))
@@ -140,7 +144,7 @@ def read_bags(
 def _check_actuators(
     extra: Mapping[str, tuple[str, ...]], command_joints: Sequence[str], command_topic: str | None
 ) -> None:
-    """ValueError where actuators are named for set-points that no command has."""
+    """ValueError where actuators are named without a command topic, or not one for each commanded joint."""
     for field, names in extra.items():
         if names and command_topic is None:
             raise ValueError(f"{field}_actuators take set-points of commands: give --command-topic too")
@@ -152,7 +156,7 @@ def _check_actuators(
 
 
 def _setpoints(command: _Timed, clock: np.ndarray, field: str, bag: Path) -> np.ndarray:
-    """[T, U] set-points of velocity or effort on a clock [T] s; ValueError where the commands hold none."""
+    """Set-points [T, U] of velocity or effort at instants [T] s; ValueError where the commands hold none."""
     time, fields = command
     if field not in fields or not np.isfinite(fields[field]).all():
         raise ValueError(f"{bag}: the command messages hold no {field} for the {field} actuators, or not throughout")
@@ -162,7 +166,7 @@ def _setpoints(command: _Timed, clock: np.ndarray, field: str, bag: Path) -> np.
 def _sent_gains(
     commands: Sequence[_Timed], extra: Mapping[str, tuple[str, ...]], bags: Sequence[Path]
 ) -> ServoGains | None:
-    """Gains that the commands themselves state, as unitree's do, with those of the actuators that take the rest.
+    """Gains that the commands themselves state, as unitree's do, for all actuators; None where they state none.
 
     A robot that adds kp (q_d - q), kd (v_d - v) and a torque is a <position>, a <velocity> and a <motor> at the joint.
     """
@@ -173,7 +177,7 @@ def _sent_gains(
         if any(np.any(fields[gain] != first[gain]) for gain in GAINS):
             warnings.warn(
                 f"{bag}: the commands change their gains kp or kd on the way: the recording states none, and a replay "
-                "has those of the scene throughout; cut it where they stay the same",
+                "uses those of the scene; cut the log to a part with constant gains",
                 stacklevel=3,
             )
             return None
@@ -184,7 +188,7 @@ def _sent_gains(
 
 
 def _unused(commands: Sequence[_Timed], topic: str | None, extra: Mapping[str, tuple[str, ...]]) -> list[str]:
-    """Set-points other than positions that the command messages hold and the recording does not; they are warned of."""
+    """Kinds of set-points that the command messages hold and the recording does not; warns where there are some."""
     found = [
         field
         for field in ("velocity", "effort")
@@ -193,7 +197,7 @@ def _unused(commands: Sequence[_Timed], topic: str | None, extra: Mapping[str, t
     if found:
         warnings.warn(
             f"the commands on {topic} have set-points of {' and '.join(found)} beside the positions, and these are "
-            "not used: a servo that follows them lags less than its replay, which looks like damping or a delay; name "
+            "not used: the servo follows them and lags less than its replay, which looks like damping or a delay; name "
             "the actuators of the MJCF that take them, --velocity-actuators, --effort-actuators",
             stacklevel=3,
         )
@@ -201,12 +205,12 @@ def _unused(commands: Sequence[_Timed], topic: str | None, extra: Mapping[str, t
 
 
 def _warn_of_rate(stamps: np.ndarray, rate: float | None, bag: Path) -> None:
-    """Warn of a stated rate that is nearly that of the stamps [M] s: who states it may take it for theirs."""
+    """Warn where the stated rate differs slightly from that of the stamps [M] s: it may be a mistake."""
     if not rate or len(stamps) < 3:
         return
     own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
     late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
-    if late > DRIFT and abs(own / rate - 1.0) < NEAR:
+    if late > LARGEST_DRIFT and abs(own / rate - 1.0) < SAME_RATE:
         warnings.warn(
             f"{bag}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "
             f"resampled (by its number of samples it would be {late:.2g} s off at the end)",
@@ -220,7 +224,7 @@ def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     if not bags:
         raise ValueError("expected one ROS bag per repeat, got none")
     if twice := [bag for i, bag in enumerate(bags) if bag.resolve() in [other.resolve() for other in bags[:i]]]:
-        raise ValueError(f"{twice[0]}: given twice; every bag is one repeat of its own")
+        raise ValueError(f"{twice[0]}: given twice; every bag must be another repeat")
     return bags
 
 
@@ -233,7 +237,10 @@ def _asked(
     command_joints: Sequence[str] | Mapping[str, str],
     motors: Sequence[int] | None,
 ) -> dict[str, Wanted]:
-    """What `read_bag` is asked for; torque: whether efforts are.  ValueError where slides are no joints."""
+    """The arguments of `read_bag`: what to read from each topic.
+
+    torque: whether efforts are read.  ValueError where slides or motors do not belong to the joints.
+    """
     if strange := [slide for slide in slides if slide not in joints]:
         raise ValueError(f"slides must be among the joints {', '.join(joints)}, got {', '.join(strange)}")
     if motors is not None and len(motors) != len(joints):
@@ -246,7 +253,9 @@ def _asked(
     if command_topic is None:
         return asked
     if place is not None and (unknown := [joint for joint in command_joints if joint not in place]):
-        raise ValueError(f"motors say nothing of the commanded joints {', '.join(unknown)}, which are not measured")
+        raise ValueError(
+            f"motors must name the commanded joints too, but {', '.join(unknown)} are not among the measured ones"
+        )
     sent = None if place is None else tuple(place[joint] for joint in command_joints)
     return {**asked, COMMAND: Wanted(command_topic, _in_messages(command_joints), "position", "command", sent, shared)}
 
@@ -257,9 +266,10 @@ def _in_messages(joints: Sequence[str] | Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
-    """The bags with these recorder's stamps [M] ns in order of time, or as they are.
+    """Order of the bags by time of recording, from their recorder's stamps [M] ns.
 
-    Bags whose times overlap have clocks that do not compare, as simulations that each begin at zero.
+    Where the times of bags overlap, the given order is returned: their clocks cannot be compared, as in simulations
+    that each begin at zero.
     """
     order = sorted(range(len(received)), key=lambda i: received[i][0])
     apart = all(received[i][-1] < received[j][0] for i, j in itertools.pairwise(order))
@@ -267,7 +277,7 @@ def _as_recorded(received: Sequence[np.ndarray]) -> list[int]:
 
 
 def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Sequence[Path]) -> bool:
-    """Whether header stamps count: one choice for all, two clocks would shift the topics."""
+    """Whether header stamps are used, for all topics alike: two clocks would shift the topics."""
     bare = [(bag, t[key].topic) for bag, t in zip(bags, tracks, strict=True) for key in t if t[key].stamped is None]
     if stamps is Stamps.HEADER and bare:
         raise ValueError(
@@ -279,7 +289,7 @@ def _use_header(tracks: Sequence[Mapping[str, Track]], stamps: Stamps, bags: Seq
 def _timed(
     tracks: Mapping[str, Track], asked: Mapping[str, Wanted], use_header: bool, bag: Path, allow_jitter: bool
 ) -> dict[str, _Timed]:
-    """Checked stamps [M] s since the first command, or without commands the first state, and the fields."""
+    """Per topic the checked stamps [M] s and the fields; time 0 is the first command, or without it the first state."""
 
     def stamps(track: Track) -> np.ndarray:
         return track.stamped if use_header and track.stamped is not None else track.received
@@ -306,19 +316,22 @@ def _timed(
 
 
 def _check_trajectories(time: np.ndarray, numbers: Sequence[int], where: str) -> None:
-    """ValueError where a message of several points, at times [M] s, was still running when the next one began."""
+    """ValueError where a message begins before the trajectory of the previous one ends.
+
+    time: instants [M] s of the points.  numbers: message of each point.
+    """
     for row in range(2, len(numbers)):
         several = numbers[row - 1] == numbers[row - 2]
         if several and numbers[row] != numbers[row - 1] and time[row] <= time[row - 1]:
             raise ValueError(
                 f"{where}, message {numbers[row]}: begins before the trajectory of message {numbers[row - 1]} has "
-                "ended, and what the controller made of both is not in this topic: read its state, "
+                "ended, and this topic does not show how the controller combined them: read its state, "
                 "--command-topic .../controller_state (JointTrajectoryControllerState)"
             )
 
 
 def _clock(states: Sequence[_Timed], rate: float | None, bags: Sequence[Path]) -> np.ndarray:
-    """[T] s, uniform, a multiple of its step, over the part that all repeats cover from 0 on."""
+    """Uniform instants [T] s, multiples of one step, over the part from 0 on that all repeats cover."""
     for bag, (time, _) in zip(bags, states, strict=True):
         if len(time) < 2 or time[-1] <= 0:
             raise ValueError(
@@ -336,9 +349,9 @@ def _channels(
     torque: bool,
     bags: Sequence[Path],
 ) -> dict[str, Channel]:
-    """torque, position and velocity on the common clock, those of them that all bags hold and measured.
+    """Those channels of torque, position and velocity that all bags hold, on the common clock.
 
-    torque: whether it is read, and must be there.
+    torque: whether it is read; ValueError where a bag then has none.
     """
     lacking = [bag for bag, (_, fields) in zip(bags, states, strict=True) if "effort" not in fields]
     if lacking and torque:
@@ -353,7 +366,7 @@ def _channels(
         values = np.stack([interpolate(clock, t, fields[field]) for t, fields in states])
         seen = np.stack([~in_gap(clock, t) for t, _ in states])
         mask = seen[:, :, None] & np.isfinite(values)
-        if not mask.any(axis=(1, 2)).all():  # a driver that does not measure it says NaN
+        if not mask.any(axis=(1, 2)).all():  # a driver that does not measure a field sends NaN
             continue
         hinge, slide = UNITS[name]
         unit = " or ".join(dict.fromkeys(slide if joint in slides else hinge for joint in joints))
@@ -368,7 +381,7 @@ def _command(
     tolerance: float,
     bags: Sequence[Path],
 ) -> np.ndarray:
-    """[T, U] the first bag's command; ValueError when another bag's differs by more than tolerance."""
+    """The first bag's command [T, U]; ValueError when another bag's differs by more than the tolerance."""
     for bag, (_, fields) in zip(bags, commands, strict=True):
         if "position" not in fields:
             raise ValueError(f"{bag}: the command messages hold no positions")

@@ -1,7 +1,8 @@
-"""Which recordings train, validate and test.
+"""Which recordings, repeats or parts of the time train, validate and test in a search for discrepancies.
 
-Two or three recordings have a role each.  One alone is divided, by its repeats or, where it has none, into blocks of
-time (`discrepancy.case.single_case`).  Both validate on the training motion; `Split.limits` says what that costs.
+Two or three recordings have a role each.  A single recording is divided: by its repeats, or into blocks of time where
+it has none (`discrepancy.case.single_case`).  Training and validation data are then of the same motion.
+`Split.limits` says what cannot be concluded from such data.
 """
 
 from __future__ import annotations
@@ -13,22 +14,21 @@ from dataclasses import replace
 
 from droid_jax.recordings.recording import Recording
 
-FEWEST_REPEATS = 8  # for sign flips: with six the smallest possible p is 0.03
+FEWEST_REPEATS = 8  # of a recording for a sign-flip test; with six, the smallest possible p is 0.03
 ROLES = ("train", "validation", "test")
-HALVES = 2 * FEWEST_REPEATS  # repeats of one recording from which each half is enough
-ELSE = (
-    "What can still be told: `python -m droid_jax.run identify` fits the parameters, and its report shows in which "
+FEWEST_IN_TWO_HALVES = 2 * FEWEST_REPEATS  # repeats of a single recording, half of which train and half validate
+INSTEAD = (
+    "Without more repeats, `python -m droid_jax.run identify` fits the parameters, and its report shows in which "
     "joint and phase simulation and robot disagree"
 )
-ALONE = "one repeat alone"  # of a log without commands
-BY_STRETCHES = (
-    "; and commanded logs in which positions were measured are searched by stretches of time, with any number of "
-    "repeats"
+SINGLE_REPEAT = "a single repeat"  # of a log without commands
+COMMANDED_WINDOWS = (
+    "; and commanded logs in which positions were measured are searched in windows of time, with any number of repeats"
 )
 
 
 class Split(enum.Enum):
-    """What fitted and validation part differ in."""
+    """What separates the training data from the validation data."""
 
     RECORDINGS = "recordings"
     REPEATS = "repeats"
@@ -37,32 +37,38 @@ class Split(enum.Enum):
 
     @property
     def limits(self) -> str:
-        """What cannot be concluded, in words; empty where nothing is to be said."""
+        """What cannot be concluded from data that are split so, in words; empty for separate recordings."""
         return {
             Split.RECORDINGS: "",
-            Split.REPEATS: "One recording both fits and confirms: the validation repeats repeat the fitted motion, so "
-            "they tell an effect from noise, but not from another one that acts alike in this motion. Only another "
-            "motion would, and nothing was kept as test data.",
-            Split.BLOCKS: "There are no repeats: U holds the noise too, and nothing tells a place from noise. The "
-            "validation blocks are of the same motion as the fitted ones, so they tell an effect from noise, but not "
-            "from another form of it.",
-            Split.WINDOWS: "There are too few repeats to tell noise from what they share: stretches of time take their "
-            "place. U holds the noise too, and nothing tells a place from noise. The validation stretches are of the "
-            "same motions as the fitted ones, so they tell an effect from noise, but not from another form of it.",
+            Split.REPEATS: "Training and validation data are repeats of one recording. The validation repeats "
+            "distinguish an effect from noise, but not from another effect that acts alike in this motion. That needs "
+            "another motion. There is no test data.",
+            Split.BLOCKS: "There are no repeats: U includes the noise, and a localisation cannot be distinguished from "
+            "noise. The validation blocks are of the same motion as the training blocks. They distinguish an effect "
+            "from noise, but not from another form of the effect.",
+            Split.WINDOWS: "There are too few repeats to separate the noise from the mean over repeats, so windows of "
+            "time are used in their place: U includes the noise, and a localisation cannot be distinguished from "
+            "noise. The validation windows are of the same motions as the training windows. They distinguish an effect "
+            "from noise, but not from another form of the effect.",
         }[self]
 
 
 def split_of(recordings: Sequence[Recording], judges: Sequence[Recording] = ()) -> Split:
-    """How recordings are to be used; judges: test data of commanded logs with few repeats.
+    """How the recordings are divided into training, validation and test data.
 
-    Raises ValueError where they are more or fewer, or hold too few repeats for any way; it says what can still be done.
+    Args:
+        recordings: one to three; any number of commanded logs with few repeats.
+        judges: test recordings of commanded logs with few repeats.
+
+    Raises:
+        ValueError: there are too many recordings, or too few repeats; the message says what can be done instead.
     """
     if _in_windows([*recordings, *judges]) and (judges or any(r.repeats < _needed(recordings) for r in recordings)):
         return Split.WINDOWS
     if judges:
         raise ValueError(
-            "recordings to judge on are for commanded logs whose positions were measured: give others as a third one, "
-            "or a log without commands as a second one"
+            "test recordings (--test-recording) are for commanded logs whose positions were measured: give the test "
+            "recording as the third --recording, or, of logs without commands, as the second"
         )
     if not 1 <= len(recordings) <= len(ROLES):
         raise ValueError(f"recordings: one to three are searched ({', '.join(ROLES)}), got {len(recordings)}")
@@ -80,18 +86,26 @@ def split_of(recordings: Sequence[Recording], judges: Sequence[Recording] = ()) 
 
 
 def _in_windows(recordings: Sequence[Recording]) -> bool:
-    """Whether all of them hold commands, and positions, from which a replay may begin anywhere."""
+    """Whether all recordings hold commands and positions, so that a replay can begin at any time."""
     return bool(recordings) and all(r.command.size and "position" in r.channels for r in recordings)
 
 
 def _needed(recordings: Sequence[Recording]) -> int:
-    """Repeats of each from which on they are what is resampled."""
-    return HALVES if len(recordings) == 1 else FEWEST_REPEATS if len(recordings) <= len(ROLES) else sys.maxsize
+    """Repeats that each recording needs for its repeats to be what is resampled."""
+    return (
+        FEWEST_IN_TWO_HALVES
+        if len(recordings) == 1
+        else FEWEST_REPEATS
+        if len(recordings) <= len(ROLES)
+        else sys.maxsize
+    )
 
 
 def roles_of(split: Split, recordings: Sequence[Recording], judges: Sequence[Recording] = ()) -> dict[str, Recording]:
-    """Role -> recording.  A log that is cut into blocks is "train" and holds the validation blocks too; of several
-    that are pooled the others are "train 2", "train 3", ..., and "test 2", ... (`pooled`).
+    """Role -> recording.
+
+    A log that is cut into blocks has the role "train" and contains the validation blocks too.  Where several recordings
+    share a role, the further ones are called "train 2", "train 3", ... and "test 2", ... (`pooled`).
     """
     if split is Split.WINDOWS:
         numbered = ((role, i, r) for role, rs in (("train", recordings), ("test", judges)) for i, r in enumerate(rs, 1))
@@ -111,7 +125,7 @@ def roles_of(split: Split, recordings: Sequence[Recording], judges: Sequence[Rec
 
 
 def pooled(roles: Mapping[str, Recording], role: str) -> list[Recording]:
-    """The recordings of a role and of its numbered ones."""
+    """All recordings that share a role: "train", "train 2", ..."""
     return [r for name, r in roles.items() if name.split(" ")[0] == role]
 
 
@@ -121,20 +135,20 @@ def _check_test(first: Recording, other: Recording) -> None:
     what = _repeats(other) if other.repeats > 1 else "commands"
     raise ValueError(
         f"the second recording {other.name!r} has {what}, and the first, {first.name!r}, is a log without repeats and "
-        "commands, beside which only another such log can be test data. Leave the second out, or give it alone: with "
-        f"{HALVES} repeats or more one half fits and the other confirms"
+        "commands. Only another such log can be its test data. Leave the second out, or give it alone: with "
+        f"{FEWEST_IN_TWO_HALVES} repeats or more, one half of them trains and the other validates"
     )
 
 
 def _check_halves(recording: Recording) -> None:
-    if recording.repeats >= HALVES:
+    if recording.repeats >= FEWEST_IN_TWO_HALVES:
         return
     raise ValueError(
         f"recording {recording.name!r} is the only one and has {_repeats(recording)}: half of its repeats train and "
-        f"half validate, and with fewer than {FEWEST_REPEATS} repeats in a half no effect stands out from "
-        f"chance. Record {HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or more of each: "
-        f"--recording TRAIN VALIDATION. {ELSE}"
-        + (BY_STRETCHES if recording.command.size else f"; and {ALONE} is searched as a log, in blocks of time")
+        f"half validate, and with fewer than {FEWEST_REPEATS} repeats in a half no effect can be "
+        f"significant. Record {FEWEST_IN_TWO_HALVES} or more, or better another motion, {FEWEST_REPEATS} repeats or "
+        f"more of each: --recording TRAIN VALIDATION. {INSTEAD}"
+        + (COMMANDED_WINDOWS if recording.command.size else f"; and {SINGLE_REPEAT} is searched in blocks of time")
     )
 
 
@@ -144,9 +158,12 @@ def _check_repeats(role: str, recording: Recording) -> None:
     log = not recording.command.size
     raise ValueError(
         f"the {role} recording {recording.name!r} has {_repeats(recording)}: with fewer than {FEWEST_REPEATS} no "
-        "effect can be "
-        f"told from chance. {ELSE}"
-        + (f"; and {ALONE}, or of each of two logs, is searched in blocks of time" if log else BY_STRETCHES)
+        f"effect can be significant. {INSTEAD}"
+        + (
+            f"; and {SINGLE_REPEAT}, or of each of two logs, is searched in blocks of time"
+            if log
+            else COMMANDED_WINDOWS
+        )
     )
 
 

@@ -1,7 +1,7 @@
-"""Tables, CSV or parquet, as columns; read with polars.
+"""Reads tables, CSV or parquet, as columns, with polars.
 
-A cell may hold a list: as a list of parquet, or as the text "[0.1, 0.2]" of CSV.  Dates become nanoseconds.  CSV files
-are read as pandas, numpy's savetxt and spreadsheets with decimal commas write them.
+A cell may hold a list: in parquet as a list, in CSV as the text "[0.1, 0.2]".  Dates become nanoseconds.  CSV files may
+be written by pandas, by numpy's savetxt, or by spreadsheets with decimal commas.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from droid_jax.recordings.log_columns import LogColumns, readable
 from droid_jax.storage import check_size
 
 MOST_BYTES = 2**31  # of a table: ten minutes of fourteen columns at 1 kHz have 150 MB
-SAMPLE = 10_000  # rows that tell the types of columns
+ROWS_FOR_TYPES = 10_000  # first rows, from which the types of the columns are inferred
 SEPARATORS = (",", ";", "\t")
 _LIST_SIGNS = r"[\[\]()]"
-# A number, with a decimal comma or without, or what stands for none.
+# A number, with a decimal comma or without, or nan or inf.
 _DECIMAL = r"^(?i:[+-]?(nan|inf)|[+-]?\d*,?\d+(e[+-]?\d+)?)$"
 
 
 def open_csv(path: Path) -> LogColumns:
-    """The columns of a CSV file, also with gzip; the separator is a comma, a semicolon or a tab.
+    """The columns of a CSV file, possibly with gzip; the separator is a comma, a semicolon or a tab.
 
-    A column without a name is called as pandas calls it, "Unnamed: 0".
+    Columns without a name get the name that pandas gives them, "Unnamed: 0".
 
     Raises:
-        ValueError: it is no such table.
+        ValueError: the file is not such a table.
     """
     if check_size(path, MOST_BYTES) == 0:
         raise ValueError(f"{path}: the file is empty")
     with readable(path, "table"):
         comments, header = _head(path)
-        # Commas inside of a list are none between columns; a header has no lists.
+        # Counted in the header, where commas cannot belong to a list.
         separator = max(SEPARATORS, key=header.count)
         options: dict[str, Any] = {"separator": separator}
         if names := _names_in_comments(comments, header, separator, path):
@@ -47,7 +47,7 @@ def open_csv(path: Path) -> LogColumns:
         frame = _read(path, options)
         if separator != ",":
             frame = frame.with_columns(_with_points(column) for column in frame if _decimal_commas(column))
-        # A space behind the separator makes texts of numbers.
+        # Names may begin with a space, where one follows the separator.
         names = [name.strip() or f"Unnamed: {i}" for i, name in enumerate(frame.columns)]
         if len(set(names)) < len(names):
             raise ValueError(f"{path}, line 1: expected a header of different names, got {shown(names, 200)}")
@@ -56,9 +56,9 @@ def open_csv(path: Path) -> LogColumns:
 
 
 def _read(path: Path, options: dict[str, Any]) -> pl.DataFrame:
-    """The table, its types as its first rows have them; where they change further down, as all have."""
-    # The last try is of texts that look like dates and are none.
-    for sample, dates in ((SAMPLE, True), (None, True)):
+    """The table; types of columns are inferred from its first rows or, where later rows differ, from all rows."""
+    # The last attempt is for texts that look like dates but are not.
+    for sample, dates in ((ROWS_FOR_TYPES, True), (None, True)):
         with contextlib.suppress(pl.exceptions.ComputeError):
             return _read_as(path, sample, dates, options)
     return _read_as(path, None, False, options)
@@ -69,7 +69,7 @@ def _read_as(path: Path, sample: int | None, dates: bool, options: dict[str, Any
 
 
 def _decimal_commas(column: pl.Series) -> bool:
-    """Whether a column holds texts of numbers with decimal commas."""
+    """Whether all texts of a column are numbers, some of them with decimal commas."""
     if column.dtype != pl.String:
         return False
     known = column.drop_nulls().str.strip_chars()
@@ -81,17 +81,17 @@ def _with_points(column: pl.Series) -> pl.Series:
 
 
 def _names_in_comments(comments: Sequence[str], header: str, separator: str, path: Path) -> list[str]:
-    """Names of the columns where the line below the comments has numbers, none where it has the names.
+    """Names of the columns from a comment, as numpy's savetxt writes them; none where a header follows the comments.
 
-    numpy's savetxt writes its header as a comment.  ValueError where no comment has as many names.
+    ValueError where there is no header and no comment has as many names as there are columns.
     """
     first = header.split(separator)
     if not all(_text_width(text) for text in first):
         return []
-    for line in comments:  # the first one with as many: units may stand below the names
+    for line in comments:  # the first one with as many words: a later one may hold the units
         if len(names := line.lstrip("# ").split(separator)) == len({*names}) == len(first):
             return names
-    if first in ([str(i + begin) for i in range(len(first))] for begin in (0, 1)):  # columns that are numbered
+    if first in ([str(i + begin) for i in range(len(first))] for begin in (0, 1)):  # a header that numbers the columns
         return []
     raise ValueError(
         f"{path}, line {len(comments) + 1}: expected the names of the columns, got numbers, {shown(header, 60)}; "
@@ -100,14 +100,14 @@ def _names_in_comments(comments: Sequence[str], header: str, separator: str, pat
 
 
 def open_parquet(path: Path) -> LogColumns:
-    """The columns of a parquet file; ValueError where it is none."""
+    """The columns of a parquet file; ValueError where the file is not parquet."""
     if check_size(path, MOST_BYTES) == 0:
         raise ValueError(f"{path}: the file is empty")
     return scan_parquet(str(path), pl.scan_parquet(path))
 
 
 def scan_parquet(where: str, rows: pl.LazyFrame) -> LogColumns:
-    """The columns of some rows of parquet files, each read when it is asked for; where: begins messages."""
+    """The columns of rows from parquet files, each read when it is asked for; where: begins messages."""
     with readable(where, "table"):
         schema = rows.collect_schema()
         first = rows.select([name for name, kind in schema.items() if _numeric(kind)]).head(1).collect()
@@ -133,7 +133,7 @@ def _units(schema: pl.Schema) -> dict[str, str]:
 
 
 def _nanoseconds(column: pl.Series) -> pl.Series:
-    """Of a column of dates, times or durations, which polars stores in days, milliseconds or finer."""
+    """Nanoseconds of a column of dates, times or durations, which polars stores in days or finer units."""
     if isinstance(column.dtype, pl.Duration):
         return column.dt.total_nanoseconds()
     return column.dt.epoch("ns") if isinstance(column.dtype, pl.Datetime | pl.Date) else column.cast(pl.Int64)
@@ -156,12 +156,12 @@ def _numeric(kind: pl.DataType) -> bool:
 
 
 def _width(column: pl.Series) -> int:
-    """Numbers in a row of a column, 0 where it holds none."""
+    """Numbers in a row of a column; 0 for a column without numbers."""
     known = column.drop_nulls()
     if column.dtype == pl.String:
         return _text_width(known[0]) if len(known) else 0
     if column.dtype == pl.Null:
-        return 1  # of a CSV file, nothing but empty cells
+        return 1  # a column of a CSV file whose cells are all empty
     if not _numeric(column.dtype):
         return 0
     if isinstance(column.dtype, pl.List | pl.Array):
@@ -179,7 +179,7 @@ def _text_width(text: str) -> int:
 
 
 def _array(column: pl.Series, where: str) -> np.ndarray:
-    """[T] or [T, W]; missing cells are NaN."""
+    """Numbers of a column, [T] or [T, W]; missing cells are NaN."""
     if column.dtype == pl.String:
         column = (
             column.str.replace_all(_LIST_SIGNS, " ").str.strip_chars().str.replace_all(r"[\s,]+", " ").str.split(" ")
@@ -194,12 +194,12 @@ def _array(column: pl.Series, where: str) -> np.ndarray:
 
 
 def _vectors(column: pl.Series, where: str) -> np.ndarray:
-    """[T, W] of lists of one length; a row that is missing is NaN."""
+    """Numbers [T, W] of a column of lists of equal length; a missing row is NaN."""
     lengths = column.list.len()
     width = int(lengths.max() or 0)  # type: ignore[arg-type]
     odd = (lengths != width).fill_null(False).arg_max() if width else None
     if odd is not None and lengths[odd] not in (None, width):
-        raise ValueError(f"{where}, row {odd}: expected {width} numbers, as in others, got {lengths[odd]}")
+        raise ValueError(f"{where}, row {odd}: expected {width} numbers, as in other rows, got {lengths[odd]}")
     out = np.full((len(column), width), np.nan)
     rows = (~lengths.is_null()).to_numpy()
     out[rows] = column.drop_nulls().explode().fill_null(np.nan).to_numpy().reshape(-1, width)

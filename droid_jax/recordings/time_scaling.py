@@ -1,4 +1,4 @@
-"""A demonstration on another clock: slower, faster, there and back, with a stop half-way."""
+"""Recordings of the same path at another speed: slower, faster, there and back, or with a stop half-way."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import numpy as np
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording
 
-STOP = 2.0  # s
+STOP = 2.0  # s, duration of the stop
 
 
 @dataclass(frozen=True)
 class TimeScaling:
-    """An experiment of the menu.
+    """A proposed experiment: the demonstration's path at another speed.
 
-    what: in words.  seconds: duration of a motion of `duration` s on the new clock; clock: (new instants [K],
-    duration) -> instants of the demonstration, s from its start.
+    what: the experiment in words.
+    seconds: duration of the demonstration, s -> duration of the experiment, s.
+    clock: (instants [K] s of the experiment, duration of the demonstration s) -> instants of the demonstration, s; both
+        from their start.
     """
 
     what: str
@@ -39,7 +41,7 @@ TIME_SCALINGS = (
 
 
 def time_scaled(recording: Recording, entry: TimeScaling) -> Recording:
-    """A recording as if its motion had been made on another clock; its noise comes along."""
+    """A recording as if its path had been followed at another speed; each sample keeps its noise."""
     first, duration = recording.time[0], recording.duration
 
     def instants(clock: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
-"""Files of `torch.save` as columns, such as the chirps of PACE, read without torch and without running their code.
+"""Reads files of `torch.save`, such as the chirps of PACE, as columns, without torch and without running their code.
 
-A file of torch (1.6 and newer) is a zip: `data.pkl` says which tensors there are, and each storage of numbers is a
-member of its own.  The pickle is read by an unpickler that knows the few names that plain tensors need and refuses
-every other, so nothing in the file is called.
+A file of torch (1.6 and newer) is a zip.  Its member `data.pkl` lists the tensors, and each storage of numbers is
+another member.  The unpickler accepts only the few names that plain tensors need, so that no code in the file is
+called.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class _Storage:
-    """Numbers of one type, in the member data/<key>."""
+    """Numbers of one type, in the zip's member data/<key>."""
 
     dtype: str
     key: str
@@ -50,7 +50,7 @@ class _Storage:
 
 @dataclass(frozen=True)
 class _Tensor:
-    """Some of them, laid out: offset, shape and strides in numbers."""
+    """Numbers of a storage as an array; offset and strides are counted in numbers."""
 
     storage: _Storage
     offset: int
@@ -59,12 +59,12 @@ class _Tensor:
 
 
 def open_torch(path: Path) -> LogColumns:
-    """The tensors of a file by name; of a dictionary in a dictionary, "outer/inner".
+    """The tensors of a file by name; in nested dictionaries, "outer/inner".
 
-    A list of texts named `joint_names` beside them is of the columns of vectors as long as it is.
+    A list of texts `joint_names` names the components of all vectors of its length.
 
     Raises:
-        ValueError: it is no file of torch.save, or holds more than tensors, numbers, texts, lists and dictionaries.
+        ValueError: the file is not of torch.save, or holds more than tensors, numbers, texts, lists and dictionaries.
     """
     check_size(path, MOST_BYTES)
     with readable(path, "file of torch.save (1.6 or newer)"), zipfile.ZipFile(path) as archive:
@@ -85,7 +85,7 @@ def open_torch(path: Path) -> LogColumns:
 
 
 def _content(path: Path, archive: zipfile.ZipFile) -> tuple[str, Any]:
-    """The folder in the zip, and the object that was saved, its tensors not read yet."""
+    """The folder in the zip, and the saved object, whose tensors are not read yet."""
     members = [m for m in archive.infolist() if m.filename.rpartition("/")[2] == "data.pkl"]
     if len(members) != 1:
         raise ValueError(f"{path}: not a file of torch.save: it has no data.pkl")
@@ -106,11 +106,11 @@ def _content(path: Path, archive: zipfile.ZipFile) -> tuple[str, Any]:
 
 
 class _Refused(Exception):
-    """A name that the pickle asks for and that is not given."""
+    """The pickle asks for a name that is not accepted."""
 
 
 class _Unpickler(pickle.Unpickler):
-    """Knows tensors and plain containers; every other name ends it before anything is called."""
+    """Unpickles tensors and plain containers; raises `_Refused` for every other name before anything is called."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("collections", "OrderedDict"):
@@ -135,7 +135,7 @@ def _rebuild(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _T
 
 
 def _flat(content: Any, path: Path) -> dict[str, Any]:
-    """Name -> value of what nested dictionaries hold; ValueError where they hold too much, or themselves."""
+    """Name -> value in nested dictionaries; ValueError where they hold too many values, or hold themselves."""
     out: dict[str, Any] = {}
     waiting, seen = [("", content)], 0
     while waiting:
@@ -157,7 +157,7 @@ def _names(content: Any) -> tuple[str, ...]:
 
 
 def _array(archive: zipfile.ZipFile, root: str, tensor: _Tensor, where: str) -> np.ndarray:
-    """A tensor's numbers; ValueError where its storage does not hold them."""
+    """The numbers of a tensor; ValueError where its storage does not hold them."""
     dtype = np.dtype(tensor.storage.dtype)
     try:
         member = archive.getinfo(f"{root}/data/{tensor.storage.key}")
@@ -168,7 +168,7 @@ def _array(archive: zipfile.ZipFile, root: str, tensor: _Tensor, where: str) -> 
     stored = tensor.storage.count * dtype.itemsize
     if len(tensor.shape) != len(tensor.strides) or not fits or member.file_size != stored:
         raise ValueError(f"{where}: damaged, shape {list(tensor.shape)} of {member.file_size} bytes")
-    # A tensor may repeat one number (a stride of 0), and so be larger than its file.
+    # A tensor may repeat one number (a stride of 0) and thus be larger than its file.
     if max(stored, math.prod(tensor.shape) * dtype.itemsize) > max(FREE_BYTES, 4 * archive.fp.seek(0, 2)):  # type: ignore[union-attr]
         raise ValueError(f"{where}: declares shape {list(tensor.shape)}, more than a file of this size explains")
     numbers = np.frombuffer(archive.read(member), dtype)[tensor.offset :]

@@ -1,8 +1,8 @@
 """Units in which logs hold joint angles, speeds and torques, as factors to the units of a recording.
 
-A recording holds rad, rad/s and N m (m, m/s and N of slides).  A log may hold degrees, encoder counts, a share of the
-joint's travel or a motor current.  `with_torque_constants` makes torques of a recording whose currents were read as
-torques.
+A recording holds rad, rad/s and N m (m, m/s and N for slides).  A log may hold degrees, encoder counts, a share of the
+joint's travel or a motor current.  `with_torque_constants` converts currents to torques in a recording whose channel
+`torque` was read as currents.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NOTE = "torque_constants"  # in `meta` of a recording whose torques were logged 
 TURN = 2.0 * math.pi
 COUNTS = ("counts", "counts/s")  # per turn of the encoder: `counts_per_turn`
 NORMALISED = {"normalised": (-100.0, 100.0), "percent": (0.0, 100.0)}  # of the joint's travel: `range`
-CURRENTS = {"A": 1.0, "mA": 1e-3, "V": 1.0, "%": 1.0}  # what a torque constant makes torques of: `torque_constant`
+CURRENTS = {"A": 1.0, "mA": 1e-3, "V": 1.0, "%": 1.0}  # converted to torques with `torque_constant`
 
 # kind of a channel -> unit -> factor, of hinges and of slides
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360.0, "turn": TURN, "counts": TURN}
@@ -47,16 +47,16 @@ KINDS = {
 
 
 def unit_factor(kind: str, unit: str, slides: bool, where: str) -> float:
-    """What one unit is in the units of a recording, counts and currents without their constant.
+    """One unit in the units of a recording; for counts and currents, without their constant.
 
     Args:
         kind: "position", "velocity" or "torque".
         unit: as a map states it.
         slides: whether the joint slides.
-        where: begins the message.
+        where: beginning of the message.
 
     Raises:
-        ValueError: the kind has no such unit.
+        ValueError: there is no such unit of this kind.
     """
     known = (SLIDES if slides else HINGES)[kind]
     if unit not in known:
@@ -66,10 +66,10 @@ def unit_factor(kind: str, unit: str, slides: bool, where: str) -> float:
 
 
 def with_torque_constants(recording: Recording, constants: Sequence[float]) -> Recording:
-    """The recording with its torques multiplied by what one unit of the log is in N m (N).
+    """The recording with its torques multiplied by the torque constants.
 
     Args:
-        recording: whose channel `torque` holds another quantity, such as amperes.
+        recording: its channel `torque` holds another quantity, such as amperes.
         constants: N m (N) per unit, one for each column of the channel or one for all; negative ones turn the sign.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What is drawn: pages, figures, films."""
+"""Pages, figures and films of results."""
 
 from droid_jax.quiet import quiet_matplotlib
 

@@ -1,4 +1,4 @@
-"""The page of `check`: what recordings hold, and what looks wrong; templates/check.html.jinja lays it out."""
+"""The page of `check`: signals and findings of recordings; templates/check.html.jinja lays it out."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from droid_jax.report.style import (
 )
 from droid_jax.report.text import html, label
 
-DRAWN = 1200  # points of a line at most
-MOST = 12  # joints that are drawn
+MOST_POINTS = 1200  # of a drawn line
+MOST_JOINTS = 12  # that are drawn
 
 
 def check_page(
@@ -37,10 +37,12 @@ def check_page(
     scene: str | None,
     excited: tuple[Excitation, MotionProposal] | None = None,
 ) -> str:
-    """HTML of recordings with what they hold and what was found in them.
+    """HTML of recordings with their signals and findings.
 
-    scene: the name of the one they are for.  excited: which parameters are identifiable in them, and
-    what would make the rest so.
+    Args:
+        recordings: each with its signals and findings.
+        scene: name of the scene that they were checked in; None without one.
+        excited: which parameters are identifiable in the recordings, and a motion that would make more of them so.
     """
     parts: list[dict[str, Any]] = []
     for i, (recording, tracks, findings) in enumerate(recordings):
@@ -57,14 +59,14 @@ def signals(recording: Recording, width: float = WIDE) -> Figure:
     """Command, position and torque of each joint over time, the mean of the repeats.
 
     Args:
-        recording: what is drawn; of more than MOST joints the first ones.
+        recording: what is drawn; only its first MOST_JOINTS joints.
         width: inches.
     """
     joints = list(
         dict.fromkeys([*recording.command_names, *(j for c in recording.channels.values() for j in c.columns)])
     )
-    figure, panels = panel_grid(min(len(joints), MOST), width, 1.9)
-    for joint, axes in zip(joints[:MOST], panels, strict=True):
+    figure, panels = panel_grid(min(len(joints), MOST_JOINTS), width, 1.9)
+    for joint, axes in zip(joints[:MOST_JOINTS], panels, strict=True):
         axes.set_title(label(joint))
         if joint in recording.command_names:
             command = recording.command[:, recording.command_names.index(joint)]
@@ -87,6 +89,6 @@ def signals(recording: Recording, width: float = WIDE) -> Figure:
 
 
 def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line [K] of DRAWN points at most."""
-    step = max(1, len(time) // DRAWN)
+    """Every k-th point of a line, about MOST_POINTS of them."""
+    step = max(1, len(time) // MOST_POINTS)
     return time[::step], values[::step]

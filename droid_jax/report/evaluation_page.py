@@ -12,7 +12,7 @@ from droid_jax.report.style import Drawing
 
 
 def evaluation_view(found: Evaluation) -> dict[str, Any]:
-    """What evaluation.html.jinja shows of an evaluation."""
+    """The values that evaluation.html.jinja shows of an evaluation."""
     return {"found": found, "file": found.file, "drawings": _draw(found)}
 
 

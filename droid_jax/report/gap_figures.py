@@ -33,13 +33,13 @@ from droid_jax.report.style import (
 from droid_jax.report.text import label, quantity, significant
 from droid_jax.report.torque_figures import residuals, shade, torque_traces
 
-LOGARITHMIC = 20.0  # ratio of largest to smallest from which an axis is logarithmic
+LOGARITHMIC = 20.0  # ratio of the largest to the smallest value above which an axis is logarithmic
 MOST_SHIFTS = 14
 U_LABEL = "Discrepancy U [σ²]"
 MODELS = ("base model", "final model")
-SCATTERS = 2.0  # half width of the band, in deviations of the repeats
-POINTS = 60  # buckets of a line: fourteen panels must fit into the page as SVG
-TINY = 0.01  # share of the smallest bar below which the discretisation error would only stretch the axis
+BAND_WIDTH = 2.0  # half width of the band, in deviations of the repeats
+POINTS = 60  # buckets of a line; so few because fourteen panels must fit into the page as SVG
+SMALL_ERROR = 0.01  # share of the smallest bar below which the discretisation error is not drawn
 BAND = "±2 deviations of the repeats"
 _BLANK: dict[str, Any] = {"facecolor": "none", "edgecolor": LINE, "hatch": "////", "linewidth": 0}
 
@@ -79,7 +79,7 @@ def _pairs(
     """Bars side by side, their numbers above them; a value at or below zero has its number at the bottom."""
     table = as_floats(values)[: 2 if extended else 1]
     least = np.min(table[table > 0], initial=np.inf)
-    tiny = error is not None and np.isfinite(least) and error < TINY * least
+    tiny = error is not None and np.isfinite(least) and error < SMALL_ERROR * least
     scale(axes, table.ravel().tolist() + ([] if error is None or tiny else [error]))
     step, size = (0.4, 0.36) if extended else (0.0, 0.5)
     for i, (row, name, colour) in enumerate(zip(table, MODELS, (BEFORE, AFTER), strict=False)):
@@ -152,7 +152,7 @@ def base_shifts(shifts: Sequence[Shift], width: float = WIDE) -> Figure:
 def cell_maps(before: Sequence[CellEntry], after: Sequence[CellEntry] | None, width: float = WIDE) -> Figure:
     """U by joint (down) and phase (across), base model and final model on one colour scale.
 
-    after: None where no effect entered the model.  A cell that the test does not find is hatched and has no colour.
+    after: None where no effect entered the model.  A cell that is not significant is hatched and has no colour.
     """
     joints, phases = joints_and_phases(before)
     tables = [cell_table(cells, joints, phases) for cells in (before, after) if cells is not None]
@@ -190,7 +190,7 @@ def joints_and_phases(cells: Sequence[CellEntry]) -> tuple[list[str], list[tuple
 
 
 def cell_table(cells: Sequence[CellEntry], joints: Sequence[str], phases: Sequence[tuple[str, float]]) -> np.ndarray:
-    """U [J, F], NaN where the test finds nothing."""
+    """U [J, F], NaN where it is not significant."""
     found = {(c.joint or "", c.phase): c.discrepancy for c in cells if c.axis == "phase" and c.found}
     return as_floats([[found.get((joint, phase)) for phase in phases] for joint in joints])
 
@@ -222,7 +222,7 @@ def _map(axes: Axes, values: np.ndarray, norm: Normalize) -> QuadMesh:
 
 @dataclass(frozen=True)
 class Bins:
-    """Cells of one axis as bars: its name with a unit, a label and U of each bin, and whether it is found."""
+    """Cells of one axis as bars: the axis with its unit, and of each bin its label, U and whether U is significant."""
 
     name: str
     labels: tuple[str, ...]
@@ -243,12 +243,12 @@ def state_bins(cells: Sequence[CellEntry], joints: Sequence[str] = ()) -> list[B
 
 
 def most_at(cells: Sequence[CellEntry]) -> str:
-    """The joint at whose position most is found; empty where there is none."""
+    """The joint with the largest cell by its position; empty where there is none."""
     return (best.joint or "") if (best := largest([c for c in cells if c.axis == "position"])) else ""
 
 
 def largest(cells: Sequence[CellEntry]) -> CellEntry | None:
-    """The largest cell that the test finds, else the largest at all; None where none has a size."""
+    """The largest significant cell, else the largest of all; None where no cell has a U."""
     known = [c for c in cells if c.discrepancy is not None]
     return max(known, key=lambda c: (c.found, c.discrepancy), default=None)
 
@@ -276,7 +276,7 @@ def state_bars(before: Sequence[CellEntry], after: Sequence[CellEntry] | None, w
     """U over the object's angle, direction and speed, each joint's direction, and position and load of the joint where
     the base model leaves most; one panel each, one scale.
 
-    after: None where no effect entered the model.  A bin that the test does not find is hatched.
+    after: None where no effect entered the model.  A bin that is not significant is hatched.
     """
     joints = (most_at(before),)
     models = [state_bins(cells, joints) for cells in (before, after) if cells is not None]
@@ -320,13 +320,13 @@ def torque_overlays(
 
 def _banded(traces: Mapping[str, Any]) -> dict[str, Any]:
     """Traces of `gap_folder.Gap` with the repeats' band, as `torque_figures` takes them."""
-    mean, half = traces["measured"], SCATTERS * traces["scatter"]
+    mean, half = traces["measured"], BAND_WIDTH * traces["scatter"]
     return {**traces, "measured_mean": mean, "measured_low": mean - half, "measured_high": mean + half}
 
 
 @styled
 def remainder(traces: Mapping[str, Any], cells: Sequence[CellEntry], unit: str, width: float = WIDE) -> Figure:
-    """Descriptive: what is left where most is left, over time at one joint and over the axis of the largest bin.
+    """The remaining residual: over time at the joint of the largest cell, and over the axis of the largest bin.
 
     traces: of the train recording.  cells: of the final model.
     """
@@ -364,13 +364,13 @@ def _curve(axes: Axes, cells: Sequence[CellEntry]) -> None:
 
 
 def located(cells: Sequence[CellEntry], joints: Sequence[str]) -> str:
-    """The joint of the largest cell by joint and phase that the test finds, else of the largest at all."""
+    """The joint of the largest significant cell by joint and phase, else of the largest cell."""
     best = largest([c for c in cells if c.axis == "phase" and c.joint in joints])
     return (best.joint or joints[0]) if best else joints[0]
 
 
 def located_bins(cells: Sequence[CellEntry]) -> list[CellEntry] | None:
-    """The bins of the axis that holds the largest found bin; None where none is found."""
+    """The bins of the axis with the largest significant bin; None where none is significant."""
     bins = [c for c in cells if c.axis != "phase" and c.high is not None]
     best = largest([c for c in bins if c.found])
     return [c for c in bins if (c.axis, c.joint) == (best.axis, best.joint)] if best else None

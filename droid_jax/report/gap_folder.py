@@ -39,7 +39,7 @@ class EffectPlace(Struct, frozen=True):
 
 
 class Placed(Struct, frozen=True):
-    """What belongs to an effect at a place."""
+    """An entry that belongs to an effect at a place."""
 
     effect: str
     location: str = ""
@@ -70,7 +70,7 @@ class HintEntry(Struct, frozen=True):
 
 
 class About(Struct, frozen=True):
-    """What the library says of an effect."""
+    """Description of an effect in the library."""
 
     what: str
     signature: str
@@ -86,7 +86,7 @@ class Ranked(Placed, frozen=True, kw_only=True):
 
 
 class ScoreEntry(Struct, frozen=True):
-    """All candidates against what a model leaves."""
+    """Score test of all candidates on the residuals of a model."""
 
     p: float | None
     ranking: list[Ranked]
@@ -101,7 +101,7 @@ class ReasonEntry(Struct, frozen=True):
 
 
 class ValidationEntry(Struct, frozen=True):
-    """A model with effects, refitted on the train recording and judged on the validation recording.
+    """A model with effects, refitted on the train recording and tested on the validation recording.
 
     parts_before: how many effects the model had before.  chosen: share of resamples in which it, or one that looks
     like it, wins.
@@ -245,7 +245,7 @@ class GapSetup(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True):
-    """The part of gap.json that answers the question."""
+    """The part of gap.json with the answer."""
 
     sentence: str
     effects: list[EffectPlace]
@@ -255,12 +255,12 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def hidden(self) -> str:
-        """What was hidden in the synthetic robot that was searched, in words; empty where nothing is known."""
+        """Description of the effects hidden in the synthetic robot; empty where it is not known."""
         return self.setup.hidden if self.setup.synthetic_robot else ""
 
     @property
     def missing_amendments(self) -> dict[str, str]:
-        """Additions to the verdict that are not there -> why; empty for one that the same command will make."""
+        """Missing addition to the verdict -> reason; an empty reason if the same command will still make it."""
         states = {n: s for n, s in self.amendments.items() if s == TO_BE_MADE or s.startswith(NOT_MADE)}
         return {n: s.removeprefix(TO_BE_MADE).removeprefix(NOT_MADE).strip(": .") for n, s in states.items()}
 
@@ -307,7 +307,7 @@ class Found(Answer, frozen=True, kw_only=True):
 
     @property
     def quantity(self) -> str:
-        """What the traces show: "Torque", "Position", "Object angle"."""
+        """The quantity of the traces: "Torque", "Position", "Object angle"."""
         return self.channel.replace("_", " ").capitalize()
 
     @property
@@ -338,12 +338,12 @@ class Gap:
 
     @property
     def roles(self) -> list[Role]:
-        """The recordings there are: "train", "validation" and perhaps "test"."""
+        """The roles with data: "train", "validation" and possibly "test"."""
         return [r for r in ROLES if r in self.found.discrepancies]
 
     @property
     def judge(self) -> Role:
-        """The role that says how large the discrepancy is: test, or validation where there is none."""
+        """The role whose discrepancy is reported: test, or validation where there is no test data."""
         return self.roles[-1]
 
     @property
@@ -368,7 +368,7 @@ class Gap:
 
     @property
     def blown_up(self) -> list[str]:
-        """Candidates and models that were left out since their replay blew up, each once."""
+        """Candidates and models that were left out because their replay blew up, each once."""
         names = [p.text for test in self.found.score_tests for p in test.failed] + self.found.failed
         return [name for name in dict.fromkeys(names) if name != LOST]
 
@@ -389,12 +389,12 @@ class Gap:
 
     @property
     def repeated(self) -> bool:
-        """Whether there are repeats, from which the noise is known; without them blocks of logs take turns."""
+        """Whether there are repeats; without them alternating blocks of time train and validate."""
         return self.found.split.by not in ("blocks", "windows")
 
     @property
     def sheets(self) -> list[tuple[tuple[Role, ...], Mapping[str, Any]]]:
-        """Roles and what is drawn of them over time, the judging role first; blocks that take turns are one sheet."""
+        """Roles and their traces to draw, the role `judge` first; alternating blocks of time share one figure."""
         first: list[tuple[Role, ...]] = [("train",), ("validation",)] if self.repeated else [("train", "validation")]
         sheets = [*first, *((r,) for r in self.roles[2:])]
         return [(roles, _joined([self.traces[r] for r in roles])) for roles in reversed(sheets)]
@@ -441,7 +441,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _faults(found: Found) -> Iterator[str]:
-    """What the types cannot say."""
+    """Faults that the types cannot express."""
     absent = [r for r in ROLES[:2] if r not in found.discrepancies]
     if absent:
         yield f"'discrepancies' lacks {', '.join(map(repr, absent))}"

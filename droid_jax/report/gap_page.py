@@ -1,4 +1,4 @@
-"""The page of a search for a missing effect: its tables, what to doubt, what to do next, and its figures.
+"""The page of a search for a missing effect: its tables, doubts, next step and figures.
 
 templates/gap.html.jinja lays it out, templates/gap_sentences.jinja has the sentences.
 """
@@ -29,19 +29,20 @@ from droid_jax.report.gap_folder import (
 )
 from droid_jax.report.style import Drawing
 
-NAME = 18  # characters in a line of a recording's name under its bars
+NAME_WIDTH = 18  # characters in a line of a recording's name under its bars
 DECISIVE = 6.0  # standardised difference from which ten repeats decide between indistinguishable models
-COARSE = 0.1  # share of U that is the discretisation error, from which the page warns
-UNCERTAIN = 0.8  # share of what is left on the validation recording beyond the fit's uncertainty, from which it is real
+LARGE_DISCRETISATION = 0.1  # share of the discretisation error in U, above which the page warns
+BEYOND_UNCERTAINTY = 0.8  # share of U after on the validation recording that the fit's uncertainty does not explain;
+# below it the page warns
 ROLES: dict[Role, str] = {"train": "training", "validation": "validation", "test": "test"}
-UNREAD = ("command", "start", "synthetic_robot", "robot", "hidden")  # options that only the program reads
+UNREAD = ("command", "start", "synthetic_robot", "robot", "hidden")  # entries of setup.json that the page does not show
 
 
 def gap_view(gap: Gap) -> dict[str, Any]:
-    """What the templates show of a search.
+    """The values that the templates show of a search.
 
     Args:
-        gap: its folder.
+        gap: folder of the search.
 
     Returns:
         The context of gap.html.jinja.
@@ -69,7 +70,7 @@ def gap_view(gap: Gap) -> dict[str, Any]:
 
 
 def gap_doubts(gap: Gap) -> list[str]:
-    """What to doubt of a search, by the names that gap_sentences.jinja has for them."""
+    """The doubts about a search, by their names in gap_sentences.jinja."""
     asked = {
         "validation_chose": "test" not in gap.roles and not gap.lost,
         "test_lost": gap.lost,
@@ -87,34 +88,34 @@ def gap_doubts(gap: Gap) -> list[str]:
 
 
 def worse_on_test(gap: Gap) -> bool:
-    """Whether a model with effects does worse than the base model on the recordings that no fit saw."""
+    """Whether a model with effects has a larger U on the test recordings than the base model."""
     test = gap.found.discrepancies.get("test")
     return gap.extended and test is not None and test.closed is not None and test.closed < 0
 
 
 def coarse_share(gap: Gap) -> float | None:
-    """Share of U of the base model on the train recording that is the discretisation error; None below COARSE."""
+    """Share of the discretisation error in U of the base model (train recording); None where it is small."""
     error, before = gap.discretisation_error, gap.found.discrepancies["train"].before
-    return error / before if error is not None and before and error > COARSE * before > 0 else None
+    return error / before if error is not None and before and error > LARGE_DISCRETISATION * before > 0 else None
 
 
 def within_uncertainty(gap: Gap) -> float | None:
-    """Share of U left on the validation recording that lies within the uncertainty of the fit; None where little."""
-    left, after = gap.found.remainder, gap.found.discrepancies["validation"].after
-    if left is None or after is None or not gap.extended:
+    """Share of U after, on the validation recording, that the fit's uncertainty explains; None where it is small."""
+    unexplained, after = gap.found.remainder, gap.found.discrepancies["validation"].after
+    if unexplained is None or after is None or not gap.extended:
         return None
-    if after <= max(gap.discretisation_error or 0.0, 0.0) or left > UNCERTAIN * after:
+    if after <= max(gap.discretisation_error or 0.0, 0.0) or unexplained > BEYOND_UNCERTAINTY * after:
         return None
-    return 1.0 - max(left, 0.0) / after
+    return 1.0 - max(unexplained, 0.0) / after
 
 
 def trends(gap: Gap) -> list[TrendEntry]:
-    """What changes significantly from repeat to repeat."""
+    """The coefficients that change significantly from repeat to repeat."""
     return [t for t in gap.found.trends if t.p is not None and t.p < gap.found.threshold("significance")]
 
 
 def gap_next_step(gap: Gap) -> str:
-    """What to do next, by the names that gap_sentences.jinja has for it."""
+    """The next step, by its name in gap_sentences.jinja."""
     verdict = gap.found.verdict
     if verdict == "indistinguishable":
         if gap.timeless or not gap.repeated:
@@ -131,7 +132,7 @@ def gap_next_step(gap: Gap) -> str:
 
 
 def in_the_simulator(gap: Gap) -> bool:
-    """Whether no named effect has its cause on the robot: each comes with a remedy in the model."""
+    """Whether every named effect is an error of the model, for which the library has a remedy."""
     return all((about := gap.found.about.get(e.effect)) and about.remedy for e in gap.found.effects)
 
 
@@ -142,7 +143,7 @@ def best_experiment(gap: Gap) -> ExperimentEntry | None:
 
 
 def decisive(experiment: ExperimentEntry) -> bool:
-    """Whether ten repeats of an experiment decide."""
+    """Whether ten repeats of an experiment decide between the alternatives."""
     return (experiment.distance or 0.0) >= DECISIVE
 
 
@@ -158,8 +159,9 @@ def untrusted(gap: Gap) -> bool:
 
 
 def where(gap: Gap) -> list[CellEntry]:
-    """The largest cells of what is left, by joint and phase and by the object's state: those that the test finds, or
-    all where there are no repeats to test.
+    """The largest cell by joint and phase, and by the object's state, of the final model's discrepancy.
+
+    Only significant cells are considered; all cells where there are no repeats to test with.
     """
     cells = [c for c in gap.found.cells.after if c.discrepancy is not None and (c.found or not gap.repeated)]
     kinds = [[c for c in cells if c.axis == "phase"], [c for c in cells if c.axis.startswith("object")]]
@@ -172,7 +174,7 @@ class Row:
     """A validation test, with the score test's statistic and explained share where its new effect was ranked.
 
     outcome: "selected", "selected, indistinguishable", "indistinguishable", "hint", "not converged",
-    "larger discrepancy", "small gain", "simpler", "failed" or "failed alone" (in the model beside others).
+    "larger discrepancy", "small gain", "simpler", "failed" or "failed alone" (though in the final model with others).
     """
 
     test: ValidationEntry
@@ -183,9 +185,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """Validation tests of models that had as many effects before.
+    """Validation tests of models that add one effect, or a pair, to the same model.
 
-    beside: these effects.  discrepancy_train, discrepancy_validation: U of the model with them.
+    beside: effects of that model.
+    discrepancy_train, discrepancy_validation: U of that model.
     """
 
     beside: tuple[EffectPlace, ...]
@@ -223,7 +226,7 @@ def _group(found: Found, count: int) -> Group:
 
 
 def outcome(found: Found, test: ValidationEntry) -> str:
-    """What became of a model after its validation test, see `Row`."""
+    """The outcome of a validated model, see `Row`."""
     parts, effects = set(test.parts), set(found.effects)
     if not test.passed:
         return "failed alone" if parts < effects else "failed"
@@ -237,8 +240,8 @@ def outcome(found: Found, test: ValidationEntry) -> str:
         return "hint"
     if found.verdict == "fit not converged":
         return "not converged"
-    left = [found.discrepancies["validation"].after, *(t.discrepancy_validation for t in found.validation_tests)]
-    if (test.discrepancy_validation or 0.0) > min(u for u in left if u is not None):
+    validation = [found.discrepancies["validation"].after, *(t.discrepancy_validation for t in found.validation_tests)]
+    if (test.discrepancy_validation or 0.0) > min(u for u in validation if u is not None):
         return "larger discrepancy"
     return "small gain" if len(test.parts) > 1 else "simpler"
 
@@ -251,7 +254,7 @@ def alternatives(found: Found) -> list[EffectPlace]:
 
 @dataclass(frozen=True)
 class Signature:
-    """Where the signature of an effect of the answer, or of an alternative to it, should appear."""
+    """The signature of an effect of the answer, or of an alternative to it, with all places of the effect."""
 
     places: tuple[EffectPlace, ...]
     alternative: bool
@@ -272,7 +275,7 @@ def signatures(found: Found) -> list[Signature]:
 
 
 def options(gap: Gap) -> dict[str, str]:
-    """What was asked for; what only distinguishes a run from another stays in its file."""
+    """The options of the run as text, without those that the page does not show."""
     return {
         name.replace("_", " "): ", ".join(map(str, value)) if isinstance(value, list) else str(value)
         for name, value in gap.options.items()
@@ -299,7 +302,7 @@ def _draw(gap: Gap) -> dict[str, list[Drawing]]:
     def add(section: str, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> None:
         sections[section].append(style.drawing(gap.folder, f"missing_{stem}", title, make, *args))
 
-    lines = [textwrap.fill(gap.recording(role), NAME, max_lines=3, placeholder=" …") for role in gap.roles]
+    lines = [textwrap.fill(gap.recording(role), NAME_WIDTH, max_lines=3, placeholder=" …") for role in gap.roles]
     names = [f"{name}\n{ROLES[role]}" for name, role in zip(lines, gap.roles, strict=True)]
     sizes = [found.discrepancies[role] for role in gap.roles]
     bars = (names, sizes, gap.discretisation_error, found.distance, extended)
@@ -317,12 +320,12 @@ def _draw(gap: Gap) -> dict[str, list[Drawing]]:
         add("shifts", "shifts", "Shifts of the base parameters", gap_figures.base_shifts, found.shifts)
     if found.verdict in ("unexplained", "partly explained"):
         curve = (gap.sheets[-1][1], found.cells.after, unit)
-        add("remainder", "remainder", "What is left", gap_figures.remainder, *curve)
+        add("remainder", "remainder", "Remaining discrepancy", gap_figures.remainder, *curve)
     return sections
 
 
 def _shown(gap: Gap, cells: Sequence[CellEntry]) -> Sequence[CellEntry]:
-    """Cells to draw; without repeats no test judges them, and all that hold an instant are shown unchanged."""
+    """Cells to draw; without repeats, which the significance test needs, all of them count as significant."""
     if gap.repeated:
         return cells
     return [structs.replace(c, found=True) for c in cells if c.discrepancy]

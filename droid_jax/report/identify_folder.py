@@ -63,21 +63,21 @@ class FittedParameter(Struct, frozen=True, kw_only=True):
 
     @property
     def deviations(self) -> float:
-        """Deviations of its prior by which it moved; in physical units where the file does not say."""
+        """Shift of the best value in deviations of the prior; in physical units where fit.json does not state it."""
         return self.standardised(self.best) if self.moved is None else self.moved
 
     @property
     def moved_far(self) -> bool:
-        """Whether it moved although it is not identifiable."""
+        """Whether the parameter moved far although it is not identifiable."""
         return not self.identifiable and abs(self.deviations) >= MOVED
 
     def standardised(self, value: float) -> float:
-        """A value in deviations of its prior, 0 at its mean."""
+        """A value in deviations of the prior from its mean."""
         return (value - self.initial_mean) / self.initial_std
 
     @property
     def bound(self) -> Literal["", "lower", "upper"]:
-        """The bound that it sits on."""
+        """The bound that the best value lies on, "lower" or "upper"."""
         if not self.on_bound:
             return ""
         return "lower" if abs(self.best - self.low) <= abs(self.best - self.high) else "upper"
@@ -105,7 +105,7 @@ class ErrorsEntry(Struct, frozen=True, kw_only=True):
 
     @property
     def rows(self) -> list[tuple[str, float | None, float | None, float | None, float | None]]:
-        """Of each joint its name and its errors: mean absolute before and after, RMS before and after."""
+        """For each joint its name, mean absolute error before and after, RMS error before and after."""
         columns = (self.joints, self.mae_before, self.mae_after, self.rms_before, self.rms_after)
         return list(zip(*columns, strict=True))
 
@@ -122,7 +122,7 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 
 
 class DistanceEntry(Struct, frozen=True, kw_only=True):
-    """Distance (equation 1) of one recording before and after the fit, and what repeats differ by.
+    """Distance (equation 1) of one recording before and after the fit, and the difference between repeats.
 
     per_joint_*: [J] root mean square of the first of the compared channels that figures are of, in per_joint_unit.
     """
@@ -141,7 +141,7 @@ class DistanceEntry(Struct, frozen=True, kw_only=True):
 
     @property
     def leading(self) -> str:
-        """The compared channel that figures and numbers of each joint are of."""
+        """The compared channel that the figures and numbers of each joint show."""
         return "torque" if "torque" in self.channels else self.channels[0]
 
 
@@ -155,7 +155,7 @@ class CostEntry(Struct, frozen=True):
 
 
 class Check(Struct, frozen=True):
-    """What the time step and the engine leave at the fitted values, in `unit`."""
+    """Errors of the time step and of the engine at the fitted values, in `unit`."""
 
     unit: str
     time_step: float
@@ -171,7 +171,7 @@ class Check(Struct, frozen=True):
 
 
 class Distances(Struct, frozen=True, kw_only=True):
-    """The distances of fit.json, by the recording that judges."""
+    """The distances of fit.json, by test recording."""
 
     heldout_distances: dict[str, DistanceEntry] = field(default_factory=dict)
     version: int = 1
@@ -197,7 +197,7 @@ class FitFile(Distances, frozen=True, kw_only=True):
 
     @property
     def channels(self) -> list[str]:
-        """What was compared, the same in all recordings."""
+        """The compared channels, the same in all recordings."""
         return next(iter(self.heldout_distances.values())).channels
 
     @property
@@ -229,7 +229,7 @@ class RunConfig(Struct, frozen=True):
     recordings: list[RecordingEntry]
     seed: int
     synthetic_robot: bool
-    judged_on: list[RecordingEntry] = field(default_factory=list)  # whole recordings that the fit did not see
+    judged_on: list[RecordingEntry] = field(default_factory=list)  # test recordings
     started: str | None = None
     device: str | None = None
     versions: dict[str, str] = field(default_factory=dict)
@@ -237,7 +237,7 @@ class RunConfig(Struct, frozen=True):
 
     @property
     def judges(self) -> list[RecordingEntry]:
-        """The recordings that the fit was judged on, in whole or in part."""
+        """The recordings with test data: whole ones, or those of which a part was held out."""
         return self.judged_on or self.recordings
 
 
@@ -280,12 +280,12 @@ class Run:
 
     @property
     def robot(self) -> str:
-        """How the page calls what was measured: a simulation is never called a robot."""
+        """Word for what was measured: "robot", or "synthetic robot" for a simulation."""
         return "synthetic robot" if self.config.synthetic_robot else "robot"
 
 
 def has_run(folder: Path) -> bool:
-    """Whether a folder holds, or should hold, an identification beside something else."""
+    """Whether a folder holds, or should hold, an identification, possibly with other results."""
     return (folder / FIT).exists()
 
 
@@ -333,7 +333,7 @@ def read_run(run: Path) -> Run:
 
 
 def trace_places(fit: Distances) -> list[str]:
-    """Where traces.npz has each compared channel: the leading one under the recording's name, others beneath it."""
+    """Keys of the compared channels in traces.npz: the recording for the leading one, recording/channel for others."""
     return [
         name if channel == distance.leading else f"{name}/{channel}"
         for name, distance in fit.heldout_distances.items()

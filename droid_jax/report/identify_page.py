@@ -1,4 +1,4 @@
-"""The page of an identification: what to doubt and what to do next by fit.json, and its figures.
+"""The page of an identification: doubts and next steps by fit.json, and its figures.
 
 templates/identify.html.jinja lays it out, templates/identify_sentences.jinja has the sentences.
 """
@@ -13,23 +13,23 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from droid_jax.recordings.split import FEWEST_REPEATS, HALVES
+from droid_jax.recordings.split import FEWEST_IN_TWO_HALVES, FEWEST_REPEATS
 from droid_jax.report import identify_figures, style, torque_figures
 from droid_jax.report.identify_folder import DistanceEntry, FitFile, FittedParameter, Run
 from droid_jax.report.style import Drawing, data_uri
 from droid_jax.report.text import label
 
-FAR = 3.0  # noise floors: a fit that leaves more, and half of the distance, has another fault than a missing effect
-NOISY = 1.5  # noise floors: a fit that leaves more leaves more than noise
-MEAN_SQUARE = 2.0  # of the whitened residuals: the same (0.6 to 1.4 in fits where nothing is missing)
+FAR_OFF = 3.0  # noise floors: above this distance, and above half the distance before, the set-up is in doubt
+ABOVE_NOISE = 1.5  # noise floors: above this distance the model lacks something
+LARGE_MEAN_SQUARE = 2.0  # of whitened residuals: above it the model lacks something (0.6 to 1.4 if nothing is missing)
 GROUPS = ("Door", "Robot", "Gripper")  # the order of the paper's Table I
 
 
 def identify_view(run: Run, searched: bool) -> dict[str, Any]:
-    """What the templates show of an identification.
+    """The values that the templates show of an identification.
 
     Args:
-        run: its folder.
+        run: folder of the identification.
         searched: whether the page holds a search for a missing effect too.
 
     Returns:
@@ -56,7 +56,7 @@ def identify_view(run: Run, searched: bool) -> dict[str, Any]:
 
 
 def fit_doubts(fit: FitFile) -> list[str]:
-    """What to doubt of a fit, by the names that identify_sentences.jinja has for them."""
+    """The doubts about a fit, by their names in identify_sentences.jinja."""
     uncertain = [p for p in fit.of_interest if not p.identifiable]
     asked = {
         "worse": any(d.after > d.before for d in fit.heldout_distances.values()),
@@ -75,7 +75,7 @@ def fit_doubts(fit: FitFile) -> list[str]:
 
 
 def next_steps(run: Run, searched: bool) -> list[str]:
-    """What to do next, by the names that identify_sentences.jinja has for it, the most urgent first."""
+    """The next steps, by their names in identify_sentences.jinja, the most urgent first."""
     fit = run.fit
     steps = ["time_step"] if any(check.too_coarse for check in fit.checks.values()) else []
     if any(f.severity == "certain" for f in fit.findings):
@@ -96,24 +96,24 @@ def next_steps(run: Run, searched: bool) -> list[str]:
 
 
 def far_off(fit: FitFile) -> bool:
-    """Whether the fit made it worse, or stayed so far from the data that its set-up is in doubt.
+    """Whether the fit increased the distance, or stays so far from the data that the set-up is in doubt.
 
-    Where no noise floor is known, two parameters at a bound have to say so.
+    Where no noise floor is known, two parameters at a bound are required in place of `FAR_OFF`.
     """
     bounds = sum(p.on_bound for p in fit.of_interest)
 
     def far(gap: DistanceEntry) -> bool:
         floor = gap.noise_floor
-        most = bounds >= 2 if floor is None else gap.after > FAR * floor
+        most = bounds >= 2 if floor is None else gap.after > FAR_OFF * floor
         return gap.after > gap.before or (most and gap.after > 0.5 * (gap.before + (floor or 0.0)))
 
     return any(far(gap) for gap in fit.heldout_distances.values())
 
 
 def lacks_something(fit: FitFile) -> bool:
-    """Whether noise alone does not explain what the fit left, by equation 1 and by its whitened residuals."""
-    far = any(g.noise_floor and g.after > NOISY * g.noise_floor for g in fit.heldout_distances.values())
-    return far or (fit.mean_square or 0.0) > MEAN_SQUARE
+    """Whether the residuals after the fit exceed the noise, by equation 1 or by the whitened residuals."""
+    far = any(g.noise_floor and g.after > ABOVE_NOISE * g.noise_floor for g in fit.heldout_distances.values())
+    return far or (fit.mean_square or 0.0) > LARGE_MEAN_SQUARE
 
 
 def noiseless(fit: FitFile) -> bool:
@@ -122,19 +122,23 @@ def noiseless(fit: FitFile) -> bool:
 
 
 def asked_of(fit: FitFile) -> str:
-    """The step that finds out whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
+    """The next step that tests whether the model of a `noiseless` fit lacks something: "search_log" or "repeats"."""
     log = len(fit.heldout_distances) <= 2 and all(gap.judged == "time" for gap in fit.heldout_distances.values())
     return "search_log" if log else "repeats"
 
 
 def needed(repeats: Sequence[int]) -> tuple[int, int, bool] | None:
-    """What `gap` takes beside recordings of so many repeats: repeats of each of two motions, or of one, and whether a
-    second motion alone will do; None where these are enough.
+    """What `gap` needs where the given repeats of the recordings are too few; None where they are enough.
+
+    Returns:
+        Repeats of each of two motions, repeats of a single motion, and whether a second motion alone would be enough.
     """
     alone = len(repeats) == 1
-    if (alone and (repeats[0] == 1 or repeats[0] >= HALVES)) or (not alone and min(repeats) >= FEWEST_REPEATS):
+    if (alone and (repeats[0] == 1 or repeats[0] >= FEWEST_IN_TWO_HALVES)) or (
+        not alone and min(repeats) >= FEWEST_REPEATS
+    ):
         return None
-    return FEWEST_REPEATS, HALVES, alone and repeats[0] >= FEWEST_REPEATS
+    return FEWEST_REPEATS, FEWEST_IN_TWO_HALVES, alone and repeats[0] >= FEWEST_REPEATS
 
 
 def grouped(parameters: Iterable[FittedParameter]) -> dict[str, list[FittedParameter]]:
@@ -189,7 +193,7 @@ def _draw(run: Run) -> dict[str, list[Drawing]]:
 
 
 def spoken(channel: str) -> str:
-    """A channel's name as a heading has it."""
+    """A channel's name as in a heading."""
     return channel.replace("_", " ").capitalize()
 
 

@@ -37,7 +37,7 @@ class MjcfEntry(Struct, frozen=True, kw_only=True):
 
 
 class AxisEntry(Struct, frozen=True):
-    """What a law's table goes over."""
+    """The variable of a law's table."""
 
     name: str
     unit: str
@@ -45,7 +45,7 @@ class AxisEntry(Struct, frozen=True):
 
 
 class LawEntry(Struct, frozen=True, kw_only=True):
-    """A law that no MJCF holds."""
+    """A law that MJCF cannot express."""
 
     effect: str
     description: str
@@ -57,14 +57,14 @@ class LawEntry(Struct, frozen=True, kw_only=True):
 
 
 class LackingEntry(Struct, frozen=True):
-    """A parameter that the MJCF has no number for."""
+    """A parameter for which the MJCF has no number."""
 
     parameter: str
     why: str
 
 
 class EngineEntry(Struct, frozen=True, kw_only=True):
-    """How far plain C MuJoCo is from the replay of a recording at the fitted values."""
+    """Difference of plain C MuJoCo from the replay of a recording at the fitted values."""
 
     channel: str
     unit: str
@@ -74,7 +74,7 @@ class EngineEntry(Struct, frozen=True, kw_only=True):
 
 
 class Neutral(Struct, frozen=True, kw_only=True):
-    """fitted.json, as far as the page shows it; patch: the text beside it."""
+    """The parts of fitted.json that the page shows; patch: text of the patch file."""
 
     mjcf: MjcfEntry
     laws: list[LawEntry] = field(default_factory=list)
@@ -84,7 +84,7 @@ class Neutral(Struct, frozen=True, kw_only=True):
 
 
 def read_neutral(folder: Path, read: Reader) -> Neutral | None:
-    """Of a folder of results; None where the version that wrote it had no such file."""
+    """The fitted MJCF of a folder of results; None where an older version wrote no such file."""
     if not (folder / FITTED_JSON).is_file():
         return None
     content = read.json(folder / FITTED_JSON)

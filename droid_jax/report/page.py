@@ -85,7 +85,7 @@ def write_report(run: Path) -> Path:
 def _context(
     folder: Path, run: Run | None, gap: Gap | None, policy: Trained | None, evaluation: Evaluation | None
 ) -> dict[str, Any]:
-    """What page.html.jinja shows: the parts of the page, and what it says above them."""
+    """The values of page.html.jinja: the parts of the page and the lines above them."""
     views = {
         "identify": identify_view(run, gap is not None) if run else None,
         "gap": gap_view(gap) if gap else None,
@@ -108,12 +108,12 @@ def _is_page(path: Path) -> bool:
 
 
 def _part(places: Sequence[Path], has: Callable[[Path], bool]) -> Path | None:
-    """Where a part of the page is: in the run's folder, or in that of one of its stages."""
+    """Folder of a part of the page: the run's, or that of one of its stages."""
     return next((at for at in places if has(at)), None)
 
 
 def _downloads(folders: Sequence[Path]) -> Iterator[tuple[Path, str]]:
-    """The files to offer, of several with one name the first."""
+    """The files that the page links; of several with the same name, the first."""
     for name, text in _DOWNLOADS:
         at = next((folder / name for folder in folders if (folder / name).is_file()), None)
         if at is not None:

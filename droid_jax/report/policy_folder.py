@@ -25,7 +25,7 @@ class TrainingSetup(Struct, frozen=True):
 
 
 class TrainingRobot(TypedDict, total=False):
-    """What is known of the synthetic robot that was fitted; empty where your own recordings were."""
+    """Description of the synthetic robot that was fitted; empty for your own recordings."""
 
     springs: int
     seed: int
@@ -72,7 +72,7 @@ class Training(Struct, frozen=True, kw_only=True):
 
 
 class Spread(Struct, frozen=True):
-    """Mean and deviation, None where nothing is left to count; each trial."""
+    """Mean and deviation over trials, None where no trial counts; and the value of each trial."""
 
     mean: float | None
     std: float | None
@@ -93,7 +93,7 @@ class Rate(Struct, frozen=True):
 
 
 class TrialsEntry(Rate, frozen=True):
-    """What came of the trials in one place (`policy.trials.Trials.to_json`)."""
+    """Results of the trials in one place (`policy.trials.Trials.to_json`)."""
 
     trials: int
     success: list[bool]
@@ -115,7 +115,7 @@ class TrialsEntry(Rate, frozen=True):
         return [a for a, why in zip(self.angle_deg.all, each, strict=True) if why != BLOWN_UP]
 
     def faults(self) -> Iterator[str]:
-        """What the types cannot say."""
+        """Faults that the types cannot express."""
         each = self.stopped_each
         for key, of in (("angle_deg", self.angle_deg.all), ("success", self.success), ("stopped_each", each)):
             if of is not None and len(of) != self.trials:
@@ -168,7 +168,7 @@ class Trained:
 
     @property
     def trials(self) -> dict[str, TrialsEntry]:
-        """Where the policy was tried -> what came of it."""
+        """Place of the trials -> their results."""
         if self.transfer is None:
             return {}
         return {"simulation": self.transfer.simulation, "synthetic robot": self.transfer.synthetic_robot}

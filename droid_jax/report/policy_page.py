@@ -1,4 +1,4 @@
-"""The page of a trained policy: what to doubt, what to do next, and its figures.
+"""The page of a trained policy: its doubts, next step and figures.
 
 templates/policy.html.jinja lays it out, templates/policy_sentences.jinja has the sentences.
 """
@@ -20,12 +20,12 @@ from droid_jax.report.identify_page import far_off
 from droid_jax.report.policy_folder import Progress, Trained, Training, TrialsEntry
 from droid_jax.report.style import AFTER, BEFORE, INK, MUTED, WIDE, Drawing, data_uri, legend, styled
 
-ENOUGH = 0.8  # success on the synthetic robot from which the next step is the robot
+ENOUGH_SUCCESS = 0.8  # success rate on the synthetic robot from which the next step is the real robot
 COLOURS = {"simulation": AFTER, "synthetic robot": BEFORE}
 
 
 def policy_view(trained: Trained, run: Run | None = None, gap: Gap | None = None) -> dict[str, Any]:
-    """What the templates show of a policy.
+    """The values that the templates show of a policy.
 
     Args:
         trained: its folder.
@@ -60,7 +60,7 @@ def wrong_model(training: Training, run: Run | None, gap: Gap | None) -> str:
 
 
 def policy_doubts(trained: Trained, wrong: str = "") -> list[str]:
-    """What to doubt of a policy, by the names that policy_sentences.jinja has for them."""
+    """The doubts about a policy, by their names in policy_sentences.jinja."""
     history = trained.training.history
     early = bool(history) and history[-1].step < history[-1].of
     asked = {
@@ -72,13 +72,13 @@ def policy_doubts(trained: Trained, wrong: str = "") -> list[str]:
 
 
 def policy_next_step(trained: Trained, gap: Gap | None) -> str:
-    """What to do next, by the names that policy_sentences.jinja has for it."""
+    """The next step, by its name in policy_sentences.jinja."""
     transfer, training = trained.transfer, trained.training
     if transfer is None:
         return "evaluate" if any(now.success >= LEARNED for now in training.history) else "train longer"
-    if transfer.synthetic_robot.success_rate >= ENOUGH:
+    if transfer.synthetic_robot.success_rate >= ENOUGH_SUCCESS:
         return "export"
-    if transfer.simulation.success_rate < ENOUGH:
+    if transfer.simulation.success_rate < ENOUGH_SUCCESS:
         return "train longer"
     if training.another_robot:
         return "another robot"

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar per stage on a terminal, a line now and then in a log file, scalars for TensorBoard."""
+"""Shows the progress of a run: bars on a terminal, lines in a log file, scalars for TensorBoard."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ from droid_jax.errors import needs
 Report = Callable[[str, Any], None]
 COMPILING = "compiling, a minute"
 FOLDER = "tensorboard"
-_COUNTS = ("generation", "iteration", "step")  # what a progress value counts with
-QUIET = 20.0  # s between two lines of one stage where there is no terminal
+_COUNTS = ("generation", "iteration", "step")  # fields of progress values that count
+LINE_PERIOD = 20.0  # s, shortest time between two lines of one stage where there is no terminal
 
 
 @contextlib.contextmanager
 def stages(names: Sequence[str], most: Mapping[str, int] | None = None) -> Iterator[Report]:
     """Show one bar per stage; yields the function that stages report to: (stage, its progress value).
 
-    most: of stages that report a text as each of their steps begins, how many steps one round has at most; the time
-    left is that of so many.  A stage that comes again, after another, begins a round of its own.
+    Args:
+        names: of the stages.
+        most: for stages that report a text at the beginning of each step, the largest number of steps; the remaining
+            time is that of so many.  A stage that comes again after another one counts its steps anew.
     """
     line = Steps(most or {}).line
     if not Console().is_terminal:
@@ -66,14 +68,14 @@ def stages(names: Sequence[str], most: Mapping[str, int] | None = None) -> Itera
 
 
 class Steps:
-    """What to show of what stages report, with the steps counted of those that report a text for each."""
+    """Turns reports of stages into text and counts; counts the steps of stages that report only a text."""
 
     def __init__(self, most: Mapping[str, int]) -> None:
         self._most = most
         self._stage, self._begun = "", 0
 
     def line(self, stage: str, value: Any) -> dict[str, Any]:
-        """Text, and how much is done of how much where that is known; empty where a stage only says that it began."""
+        """Text, and steps done and in total where known; empty where a stage only reports its beginning."""
         if stage != self._stage:
             self._stage, self._begun = stage, 0
         if not isinstance(value, str):
@@ -85,7 +87,7 @@ class Steps:
 
 
 def _line(value: Any) -> dict[str, Any]:
-    """What to show of a stage's progress value."""
+    """Text and counts of a stage's progress value."""
     if hasattr(value, "generation"):
         text = f"cost {value.best_cost:.4g}  sigma {value.sigma:.2g}"
         return {"completed": value.generation, "total": value.generations, "text": text}
@@ -121,7 +123,7 @@ def training(steps: int) -> Iterator[Callable[[Any], None]]:
 
 @contextlib.contextmanager
 def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show one bar for a number of equal things; yields the function that takes how many are done."""
+    """Show one bar for a number of equal steps; yields the function that takes how many are done."""
     if not Console().is_terminal:
         lines = Lines()
         lines.show(what, "", 0, total)
@@ -141,13 +143,13 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _trained(now: Any) -> str:
-    """What to show of a `TrainProgress`."""
+    """Text of a `TrainProgress`."""
     rate = f"{now.rate:,.0f} actions/s" if now.rate else "started"
     return f"reward {now.reward:.0f}  success {now.success:.0%}  {rate}"
 
 
 class Lines:
-    """Lines in place of bars: one where a stage begins, then at most one every QUIET seconds and one at its end."""
+    """Lines in place of bars: at the beginning and end of a stage, and at most every LINE_PERIOD seconds."""
 
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, line: Callable[[str, Any], dict[str, Any]] | None = None
@@ -155,23 +157,23 @@ class Lines:
         self._clock, self._line = clock, line or Steps({}).line
         self._stage = ""
         self._began = self._last = 0.0
-        self._first = (0.0, 0.0)  # s and count of the stage's first line: what compiled before it tells no rate
+        self._first = (0.0, 0.0)  # s and count where the rate is measured from: the time before includes compilation
 
     def report(self, stage: str, value: Any) -> None:
-        """What `stages` yields."""
+        """Print a stage's progress value; the function that `stages` yields."""
         line = self._line(stage, value)
         counts = line.get("completed", 0), line.get("total", 0)
         self.show(stage, line.get("text", ""), *counts, left=line.get("left", "about"))
 
     def show(self, stage: str, text: str, done: float, total: float, *, left: str = "about") -> None:
-        """Print where a stage stands, if it is time to; left: how sure the time left is."""
+        """Print the state of a stage, if LINE_PERIOD has passed; left: word before the remaining time."""
         now = self._clock()
         new = stage != self._stage
         if new:
             self._stage, self._began, self._first = stage, now, (now, done)
-        elif not self._first[1] and done:  # the first count: the clock of the rate starts here
+        elif not self._first[1] and done:  # the first count: the rate is measured from here
             self._first = (now, done)
-        elif now - self._last < QUIET and not (total and done >= total):
+        elif now - self._last < LINE_PERIOD and not (total and done >= total):
             return
         self._last, spent = now, now - self._began
         more, since = done - self._first[1], now - self._first[0]
@@ -181,7 +183,7 @@ class Lines:
 
 
 def needs_writer(wanted: bool) -> None:
-    """ValueError that says what to install where scalars are wanted and nothing can write them."""
+    """ValueError, with what to install, where scalars are wanted and tensorboardX is missing."""
     if wanted:
         needs("--tensorboard needs", "tensorboard", "tensorboardX")
 
@@ -190,7 +192,7 @@ def needs_writer(wanted: bool) -> None:
 def scalars(folder: Path | None) -> Iterator[Callable[[str, Any], None]]:
     """Write FOLDER/events*; yields the function that stages report to: (stage, its progress value).
 
-    folder: None for nothing.  Raises ValueError where tensorboardX is not installed.
+    folder: None writes nothing.  Raises ValueError where tensorboardX is not installed.
     """
     needs_writer(folder is not None)
     if folder is None:

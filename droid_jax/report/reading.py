@@ -26,7 +26,7 @@ class Reader:
     """Reads what one command wrote; every fault is a ValueError that names the file.
 
     command: "identify", "gap", "train" or "evaluate", to run again where something is missing or broken.
-    option: what it then needs beside the same options ("--again").
+    option: a further option that the command then needs ("--again").
     """
 
     command: str
@@ -50,7 +50,7 @@ class Reader:
         return self.typed(value, kind, str(path))
 
     def typed(self, value: Any, kind: type[Content], where: str) -> Content:
-        """A parsed JSON value as a type; fault at the first place where it is something else."""
+        """A parsed JSON value as a type; fault at the first place where it has another type."""
         try:
             return typed(value, kind, where)
         except ValueError as error:
@@ -111,8 +111,11 @@ def read_replay(path: Path, read: Reader) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def read_measured(path: Path, read: Reader) -> tuple[str, float, np.ndarray, list[str]]:
-    """Of a replay.npz its recording's name, when its commands begin [s], the measured positions [K, nq] and whose
-    they are; without a joint where none was measured, or where an older version wrote the file."""
+    """From a replay.npz: the recording's name, time of the first command [s], measured positions [K, nq] and their
+    joints.
+
+    There are no joints where no position was measured, or where an older version wrote the file.
+    """
     names = ("recording", "start", "measured", "measured_joints")
     found = read.arrays(path, ("time", "after"), names, texts=("recording", "measured_joints"))
     if not all(name in found for name in names):
@@ -124,7 +127,7 @@ def read_measured(path: Path, read: Reader) -> tuple[str, float, np.ndarray, lis
 
 
 class FindingEntry(Struct, frozen=True):
-    """What a check of a recording found (`preflight.findings`)."""
+    """A finding of the checks of a recording (`preflight.findings`)."""
 
     kind: str
     column: str

@@ -1,4 +1,4 @@
-"""The page of `rehearse`: what would be found, from which size, and what would help; of rehearsal.json alone."""
+"""The page of `rehearse`: from which size effects would be found, and what would help; from rehearsal.json alone."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from droid_jax.report.text import counted, html, label, listed, percent, quantit
 
 Result = Mapping[str, Any]
 MOST_ALTERNATIVES = 3
-MOST, MOST_PAIRS, MOST_NAMES = 6, 3, 3  # things that a sentence lists
-KNOWN = ("N m", "N", "kg", "m", "rad", "s")  # units of sizes that people have a feeling for
-NEAR = 2.0  # times the minimum effect size
-HELPS = 1.1  # times smaller, from which a change is worth a sentence
+MOST, MOST_PAIRS, MOST_NAMES = 6, 3, 3  # effects or parameters, pairs, and recordings that a sentence lists
+FAMILIAR_UNITS = ("N m", "N", "kg", "m", "rad", "s")  # of the effects that the first sentence prefers
+NEAR_MINIMUM = 2.0  # times the minimum effect size: effects found below it are counted apart
+WORTH_MENTION = 1.1  # times smaller sizes, from which a sentence recommends a change
 
 
 def rehearsal_page(result: Result) -> str:
-    """HTML of a rehearsal, as its JSON holds it."""
+    """HTML of a rehearsal from the content of its JSON file."""
     figure = Markup(inline_svg(settled(smallest_figure(result)), "sizes"))
     return html(
         "rehearsal.html.jinja",
@@ -38,7 +38,7 @@ def rehearsal_page(result: Result) -> str:
 
 
 def motions_of(result: Result) -> str:
-    """Their names, of many the first ones and how many there are."""
+    """Names of the recordings; of many, their number and the first and last name."""
     names = list(result["recordings"])
     return (
         listed(names) if len(names) <= MOST_NAMES else f"{counted(len(names), 'recording')}, {names[0]} to {names[-1]}"
@@ -46,7 +46,7 @@ def motions_of(result: Result) -> str:
 
 
 def best_of(result: Result) -> list[dict[str, Any]]:
-    """Of each effect at each place the coefficient that is found at the smallest multiple of its minimum size."""
+    """For each effect and place, the coefficient found at the smallest multiple of its minimum effect size."""
     best: dict[tuple[str, str], dict[str, Any]] = {}
     for entry in result["effects"]:
         key = (entry["effect"], entry["location"])
@@ -63,7 +63,7 @@ def _multiple(entry: Mapping[str, Any]) -> float:
 
 
 def effect_rows(result: Result) -> list[tuple[str, ...]]:
-    """Effect, place, smallest size, what decides it, what it is taken for; place by place."""
+    """Effect, place, smallest size, the test that limits it, and the effects it is confused with; sorted by place."""
     rows = []
     for e in best_of(result):
         size = "not found" if e["smallest"] is None else quantity(e["smallest"], e["unit"], 2)
@@ -88,7 +88,7 @@ def _alternatives(entry: Mapping[str, Any]) -> str:
 
 
 def parameter_rows(result: Result) -> list[tuple[str, ...]]:
-    """Name, share of the prior's width left, recovered or not, partners; nuisances are left out."""
+    """Name, posterior width as a share of the prior's, recovered or not, correlated parameters; without nuisances."""
     return [
         (
             label(p["name"]),
@@ -102,7 +102,7 @@ def parameter_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def noise_rows(result: Result) -> list[tuple[str, ...]]:
-    """Channel, column, deviation of one sample, where it comes from."""
+    """Channel, column, noise of one sample (standard deviation), its source."""
     return [
         (n["channel"].replace("_", " "), label(n["column"]), quantity(n["deviation"], n["unit"], 2), n["source"])
         for n in result["how"]["noise"]
@@ -110,7 +110,7 @@ def noise_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def help_rows(result: Result) -> list[tuple[str, ...]]:
-    """What would change, by how much sizes shrink, effects found beside, parameters recovered beside."""
+    """The change, the factor by which sizes shrink, and how many more effects and parameters are found."""
     return [
         (
             h["what"],
@@ -123,7 +123,7 @@ def help_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def full_rows(result: Result) -> list[tuple[str, ...]]:
-    """Of the complete rehearsals: effect, place, found of how many at each size."""
+    """Of the complete rehearsals: effect, place, number found at each size, effects named instead, hidden law."""
     rows = []
     for e in result.get("full", {}).get("effects", ()):
         unit = next((q["unit"] for q in result["effects"] if q["coefficient"] == e["coefficient"]), "-")
@@ -134,14 +134,14 @@ def full_rows(result: Result) -> list[tuple[str, ...]]:
 
 
 def rehearsal_sentences(result: Result) -> list[str]:
-    """What a person can act on, the most important first."""
+    """Sentences that the user can act on, the most important first."""
     best = best_of(result)
     found = [e for e in best if e["smallest"] is not None and _sure(e)]
     doubtful = [e for e in best if e["smallest"] is not None and not _sure(e)]
     lost = [e for e in best if e["smallest"] is None]
     out = []
     if found:
-        ranked = sorted([e for e in found if e["unit"] in KNOWN] or found, key=_multiple)
+        ranked = sorted([e for e in found if e["unit"] in FAMILIAR_UNITS] or found, key=_multiple)
         first, last = next((e for e in ranked if e["unit"] == "N m"), ranked[0]), ranked[-1]
         sentence = (
             f"With this motion {_thing(first)} would be found from {quantity(first['smallest'], first['unit'], 2)}"
@@ -152,14 +152,14 @@ def rehearsal_sentences(result: Result) -> list[str]:
     else:
         out.append("With this motion no effect would surely be found.")
     out += _help(result)
-    near = [e for e in found if _multiple(e) <= NEAR]
+    near = [e for e in found if _multiple(e) <= NEAR_MINIMUM]
     out.append(
-        f"Of {counted(len(best), 'effect')}, counted at each place, {len(near)} would be found below {NEAR:g} times "
-        f"the minimum effect size, {len(found) - len(near)} only when larger, {len(lost)} at no size within bounds"
-        + (f"; {len(doubtful)} doubtful." if doubtful else ".")
+        f"Of {counted(len(best), 'effect')}, counted at each place, {len(near)} would be found below "
+        f"{NEAR_MINIMUM:g} times the minimum effect size, {len(found) - len(near)} only when larger, "
+        f"{len(lost)} at no size within bounds" + (f"; {len(doubtful)} doubtful." if doubtful else ".")
     )
     if doubtful:
-        out.append(f"Something would be seen, but probably not named for what it is: {_doubts(doubtful)}.")
+        out.append(f"These would be seen, but probably not named correctly: {_doubts(doubtful)}.")
     if lost:
         out.append(f"At no size: {_by_effect(lost, best)}.")
     if alike := _alike(found):
@@ -174,13 +174,13 @@ def rehearsal_sentences(result: Result) -> list[str]:
 
 
 def _help(result: Result) -> list[str]:
-    """What would help most."""
+    """A sentence about the most helpful change; none where no change was tried."""
     if not result["helps"]:
         return []
     h = result["helps"][0]
-    if not (h["times_smaller"] > HELPS or h["newly_found"] > h["lost"] or h["recovered_more"] > 0):
+    if not (h["times_smaller"] > WORTH_MENTION or h["newly_found"] > h["lost"] or h["recovered_more"] > 0):
         return ["More repeats, other channels or a faster motion would help little."]
-    more = [f"sizes {h['times_smaller']:.1f} times smaller"] if h["times_smaller"] > HELPS else []
+    more = [f"sizes {h['times_smaller']:.1f} times smaller"] if h["times_smaller"] > WORTH_MENTION else []
     if h["newly_found"] > h["lost"]:
         more.append(f"{counted(h['newly_found'] - h['lost'], 'more effect')} found")
     if h["recovered_more"] > 0:
@@ -201,7 +201,7 @@ def _doubts(entries: list[dict[str, Any]]) -> str:
 
 
 def _by_effect(entries: list[dict[str, Any]], every: list[dict[str, Any]]) -> str:
-    """ "encoder offset at 2 of 7 places, opening check at door"."""
+    """Effects with their places: "encoder offset at 2 of 7 places, opening check at door"."""
     said = []
     for effect in dict.fromkeys(e["effect"] for e in entries):
         mine, of = ([e for e in some if e["effect"] == effect] for some in (entries, every))
@@ -221,7 +221,7 @@ def _alike(found: list[dict[str, Any]]) -> str:
 
 
 def how_sentences(result: Result) -> list[str]:
-    """How it was computed."""
+    """Sentences about how the rehearsal was computed."""
     how = result["how"]
     rows = counted(how["repeats"], "repeat") if how["repeats"] else f"{how['blocks']} blocks of time"
     share = how["rehearsal"]["share"]
@@ -230,16 +230,16 @@ def how_sentences(result: Result) -> list[str]:
         f"Found means in {share:.0%} of {how['rehearsal']['draws']} drawn noises: the score test over "
         f"{how['directions']} coefficients has p < {how['significance']:g}, and the validation test p < "
         f"{how['confirmation']:g}.",
-        "The residual is taken to be linear in parameters and effects.",
-        "Then each effect was simulated at the size that is found; one whose law has a shape also with the law of the "
-        "synthetic robot. Doubtful: the library's effect takes less than "
-        f"{percent(how['rehearsal'].get('known', 0.5))} of that, or another one takes clearly more.",
-        f"Recovered means that less than {percent(how['recovered_below'])} of the prior's width is left.",
+        "The residual is assumed to be linear in parameters and effects.",
+        "Then each effect was simulated at the size that is found. An effect whose law has a shape was also simulated "
+        "with the law of the synthetic robot. Doubtful: the library's effect explains less than "
+        f"{percent(how['rehearsal'].get('known', 0.5))} of that residual, or another effect explains clearly more.",
+        f"Recovered means that the posterior width is less than {percent(how['recovered_below'])} of the prior's.",
     ]
     if not result.get("full"):
         out.append("Nothing was fitted: these sizes are predictions. Complete rehearsals (--full) check them.")
     if how["simulated"]:
-        out.append("What was measured is replaced by what the scene makes of the commands, with this noise.")
+        out.append("Measurements are replaced by a simulation of the commands in the scene, with this noise.")
     return out
 
 

@@ -30,8 +30,8 @@ RATE = 12.5  # pictures per second
 LONGEST = 150  # pictures
 SIZE = (270, 360)  # height, width
 QUALITY = 60  # of WebP
-LAST = 1.5  # s for which the last picture stays
-LOOPS = 3  # then it rests on the last picture: a page without scripts has no button that stops it (WCAG 2.2.2)
+LAST_SECONDS = 1.5  # for which the last picture stays
+LOOPS = 3  # times a film is played, since a page without scripts has no button that stops it (WCAG 2.2.2)
 _OFF = ("disable", "disabled", "off", "false", "0")
 _PROBE_SECONDS = 60.0
 
@@ -100,7 +100,7 @@ def save_image(path: Path, image: np.ndarray) -> None:
 def film(
     path: Path, model: mujoco.MjModel, sides: Sequence[np.ndarray], period: float, camera: str | None = "front"
 ) -> list[np.ndarray]:
-    """Write states [T, nq], `period` s apart, as PATH (webp), in the time they took; several side by side.
+    """Write states [T, nq], `period` s apart, as a film in PATH (webp) in real time, several sides beside each other.
 
     sides: each [T, nq].  camera: see `frames`.
     Returns its pictures, uint8 [height, width of all sides, 3] each.
@@ -117,7 +117,7 @@ def film(
     drawn = rendered_frames(model, np.concatenate(sides), _rows(length, every, len(sides)), camera, SIZE)
     images = np.concatenate(np.array_split(np.array(drawn), len(sides)), axis=2)
     pictures = [Image.fromarray(image) for image in images]
-    shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST)]
+    shown = [round(1e3 * every * period)] * (len(pictures) - 1) + [round(1e3 * LAST_SECONDS)]
     with io.BytesIO() as buffer:
         timing: dict[str, Any] = {"duration": shown, "loop": LOOPS}
         pictures[0].save(buffer, format="WEBP", save_all=True, append_images=pictures[1:], quality=QUALITY, **timing)
@@ -126,12 +126,12 @@ def film(
 
 
 def picture_rows(time: np.ndarray) -> list[int]:
-    """Rows of states at these times [T] s, regular, of which `film` has pictures."""
+    """Rows of states at regular times [T] s for the pictures of `film`."""
     return _rows(len(time), _every(len(time), float(time[1] - time[0]) if len(time) > 1 else 1.0), 1)
 
 
 def _every(length: int, period: float) -> int:
-    """Every how many states a film has a picture."""
+    """Number of states from one picture of a film to the next."""
     return max(1, round(1.0 / (RATE * period)), -(-length // LONGEST))
 
 
@@ -141,7 +141,7 @@ def _rows(length: int, every: int, sides: int) -> list[int]:
 
 
 def working_backend() -> str:
-    """The value of MUJOCO_GL that draws on this machine, found once by drawing an empty scene.
+    """The value of MUJOCO_GL that works on this machine, found once by drawing an empty scene.
 
     Raises NoOpenGL, which says what was tried and what to install.
     """
@@ -156,7 +156,7 @@ def working_backend() -> str:
 
 @cache
 def _first_to_draw(backends: tuple[str, ...]) -> tuple[str | None, list[str]]:
-    """The first of these that draws, None where none does (kept too: each may take a minute); what failed, and why."""
+    """The first backend that draws, or None, and the failures with their reasons; cached, as each may take a minute."""
     tried = []
     for backend in backends:
         error = _child(backend, None, _PROBE_SECONDS)
@@ -172,7 +172,7 @@ def _candidates(wish: str, platform: str) -> list[str]:
     if wish in _OFF:
         raise NoOpenGL(f"MUJOCO_GL={wish!r} turns drawing off; unset it to get pictures")
     if not platform.startswith("linux"):
-        return list(dict.fromkeys([wish, ""]))  # there the default already draws without a window
+        return list(dict.fromkeys([wish, ""]))  # the default there draws without a window
     return list(dict.fromkeys([w for w in (wish, "egl", "osmesa") if w]))
 
 
@@ -180,7 +180,7 @@ def _child(backend: str, folder: str | None, seconds: float) -> str:
     """Run this file's `_draw` under a backend; "" when it worked, else one line that says why not."""
     environment = {**os.environ, "MUJOCO_GL": backend}
     environment.pop("PYOPENGL_PLATFORM", None)  # set by an earlier import, it would contradict MUJOCO_GL
-    # -P: this file's folder must not come first on the path, its neighbours could hide other modules.
+    # -P: without it this file's folder comes first on the path, where its modules could hide others.
     command = [sys.executable, "-P", __file__, *([folder] if folder else [])]
     try:
         done = subprocess.run(
@@ -224,7 +224,7 @@ def _check_view(model: mujoco.MjModel, camera: str | None, size: tuple[int, int]
 def _save_job(
     folder: Path, model: mujoco.MjModel, states: np.ndarray, camera: str | None, size: tuple[int, int]
 ) -> None:
-    """What the child reads: the compiled model, the states and the view."""
+    """Write the input of the child process: the compiled model, the states and the view."""
     import mujoco
 
     mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
@@ -233,7 +233,7 @@ def _save_job(
 
 
 def _draw(folder: Path | None) -> None:
-    """The child's work: draw the job in `folder`, or, without one, an empty scene as a probe."""
+    """Run in the child process: draw the job in `folder`, or without a folder an empty scene as a probe."""
     import mujoco
 
     if folder is None:
@@ -245,7 +245,7 @@ def _draw(folder: Path | None) -> None:
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     view = json.loads((folder / "view.json").read_text())
     data, option, images = mujoco.MjData(model), mujoco.MjvOption(), []
-    if not (model.geom_bodyid > 0).any():  # kinematics and inertias alone: boxes of the inertias and joints are drawn
+    if not (model.geom_bodyid > 0).any():  # a model without geoms: draw joints, and inertias as boxes
         option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = option.flags[mujoco.mjtVisFlag.mjVIS_JOINT] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_COM] = True
         model.vis.rgba.inertia, model.vis.headlight.ambient = (0.75, 0.8, 0.9, 1.0), (0.5, 0.5, 0.5)
@@ -261,7 +261,7 @@ def _draw(folder: Path | None) -> None:
 
 
 def _seen_whole(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Let the camera and the size of marks follow joints and centres of mass: MuJoCo's extent is too large for some."""
+    """Set camera and marks by joints and centres of mass; MuJoCo's extent is too large for some models."""
     import mujoco
 
     mujoco.mj_forward(model, data)

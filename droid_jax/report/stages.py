@@ -1,6 +1,6 @@
-"""Runs' folders to one another: options of a run, whether it is whole, what a policy was trained on.
+"""Relations between the folders of runs: options of a run, whether it is complete, which fit a policy used.
 
-Light: commands ask before anything is imported that takes time.
+Imports little, because commands call it before they import anything that takes time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _MEND = "start the run of this folder over with --again"
 
 
 class Robot(TypedDict, total=False):
-    """What is known of a synthetic robot that was recorded."""
+    """Description of the synthetic robot that was recorded."""
 
     springs: int
     seed: int
@@ -24,7 +24,7 @@ class Robot(TypedDict, total=False):
 
 
 class Setup(TypedDict, total=False):
-    """What other commands read of a setup.json; it holds every option of its own."""
+    """The entries of setup.json that other commands read; the file holds all options of its command."""
 
     command: str
     preset: str
@@ -47,7 +47,7 @@ class Setup(TypedDict, total=False):
 
 
 class Description(TypedDict, total=False):
-    """What other commands read of a config.json or gap.json."""
+    """The entries of config.json or gap.json that other commands read."""
 
     synthetic_robot: bool
     robot: Robot
@@ -56,12 +56,12 @@ class Description(TypedDict, total=False):
 
 
 def setup(folder: Path) -> dict[str, Any]:
-    """setup.json of a run's folder, empty where there is none; ValueError for one that is damaged."""
+    """setup.json of a run's folder, empty where there is none; ValueError for a damaged file."""
     return _read(folder / SETUP, Setup)
 
 
 def described_in(path: Path) -> dict[str, Any]:
-    """What a config.json or gap.json says, empty where there is none; ValueError for one that is damaged."""
+    """Content of a config.json or gap.json, empty where there is none; ValueError for a damaged file."""
     return _read(path, Description)
 
 
@@ -80,36 +80,36 @@ def _read(path: Path, kind: type) -> dict[str, Any]:
 
 
 def unfinished(folder: Path) -> bool:
-    """Whether a run began in a folder and is not whole: what lies there may be an earlier run's."""
+    """Whether a run began in a folder and is not complete; other files there may be of an earlier run."""
     return bool(setup(folder)) and not any((folder / last).is_file() for last in LAST_FILES.values())
 
 
 def to_be_amended(folder: Path) -> bool:
-    """Whether a search was stopped after its verdict was written: the same command makes what is to be added to it."""
+    """Whether a search was stopped after its verdict, so that the same command still has additions to make."""
     states = described_in(folder / GAP).get("amendments")
     return isinstance(states, dict) and TO_BE_MADE in states.values()
 
 
 def needs_whole(folder: Path) -> None:
-    """ValueError for a folder whose run is not whole."""
+    """ValueError for a folder whose run is not complete."""
     if unfinished(folder):
-        raise ValueError(f"{folder} holds a run that is not whole: run its command again, it goes on from where it was")
+        raise ValueError(f"{folder} holds a run that is not complete: run its command again, which continues it")
 
 
 def extended_of(folder: Path) -> Path | None:
-    """The extended model that a run's Gaussian belongs to: its own file, or the one that it was to fit."""
+    """The extended model that a run's Gaussian belongs to: the one it wrote, or the one it was given."""
     given = setup(folder).get("extended")
     return folder / EXTENDED if (folder / EXTENDED).is_file() else Path(given) if given else None
 
 
 def gaussian_of(folder: Path) -> Path:
-    """Where a folder keeps the Gaussian to train on: with the nuisances, where a fit had any."""
+    """File of the Gaussian to train on: the one with nuisances, where the fit had any."""
     full = folder / FULL_GAUSSIAN
     return full if full.is_file() else folder / GAUSSIAN
 
 
 def fingerprint(folder: Path | None) -> str | None:
-    """Hash of what a policy is trained on; None for the prior."""
+    """Hash of the model that a policy is trained on; None for the prior."""
     return None if folder is None else _hash_with(gaussian_of(folder), folder)
 
 
@@ -119,9 +119,10 @@ def _hash_with(gaussian: Path, folder: Path) -> str:
 
 
 def left_over(whole: Path) -> frozenset[str]:
-    """Stages in a folder of `all` that belong to an earlier run of it.
+    """Stages in a folder of `all` that belong to an earlier run.
 
-    A search in other recordings, or with another scene, than the fit's; a policy of another fit than the folder's.
+    These are a search in other recordings or another scene than the fit's, and a policy of another fit than the
+    folder's.
     """
     fit, gap, train = (setup(whole / stage) for stage in LAST_FILES)
     out = set[str]()
@@ -137,7 +138,7 @@ def left_over(whole: Path) -> frozenset[str]:
 
 
 def _apart(fit: dict[str, Any], gap: dict[str, Any]) -> bool:
-    """Whether a search was made in something else than was fitted; presets have time steps of their own."""
+    """Whether search and fit used other recordings or scenes; the scene may differ by its time step between presets."""
     recorded, searched = (of.get("recordings_sha256") for of in (fit, gap))
     if recorded is None or searched is None:
         return False

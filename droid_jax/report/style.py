@@ -98,7 +98,7 @@ P = ParamSpec("P")
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Draw under the house style, whatever the caller's own matplotlib settings are."""
+    """Decorator: draw with STYLE, independent of the caller's matplotlib settings."""
 
     @wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -143,7 +143,7 @@ def legend(figure: Figure, source: Axes | Sequence[Axes], width: float, columns:
 
 
 def settled(figure: Figure) -> Figure:
-    """The figure with its panels arranged for good: saving it several times need not arrange them again.
+    """The figure with its layout fixed, so that saving it several times does not compute the layout again.
 
     A name's dollar signs are no mathematics, and names below an axis that would overlap are turned.
     """
@@ -158,7 +158,7 @@ def settled(figure: Figure) -> Figure:
 
 
 def _read_as_written(figure: Figure) -> None:
-    """No text but the numbers of logarithmic axes is mathematics."""
+    """Switch mathematical notation off in all texts except the numbers of logarithmic axes."""
     logarithmic = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) if axis.get_scale() != "linear"]
     powers = {id(text) for axis in logarithmic for text in axis.findobj(Text)}
     for text in figure.findobj(Text):
@@ -270,7 +270,7 @@ def drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *a
 
 
 def _inline(figure: Figure, stem: str, kind: str, title: str) -> Markup:
-    """SVG, or PNG on a white card where the SVG would be too long; the caption describes it to those who cannot see."""
+    """SVG, or PNG on a white card where the SVG would be too long; the caption describes it."""
     svg = inline_svg(figure, f"{stem}-{kind}")
     points = 72 * figure.get_figwidth()
     if len(svg) <= SVG_LIMIT:

@@ -22,10 +22,11 @@ MOST_BYTES = 256 * 2**20  # of a table
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """samples: a row for each draw of the fitted Gaussian, a column for each parameter in its unit.
+    """The tables of a fit.
 
+    samples: a row for each draw of the fitted Gaussian, a column for each parameter in its unit.
     history: by generation, the search's costs (best_cost, median_cost), sigma [deviations], and mean_NAME and std_NAME
-    of each parameter in its unit.
+        of each parameter in its unit.
     """
 
     samples: pd.DataFrame
@@ -43,10 +44,10 @@ def frames(folder: str | Path) -> Frames:
 
     Raises:
         ImportError: pandas is not installed.
-        ValueError: the folder holds no whole fit.
+        ValueError: the folder holds no complete fit.
     """
-    if told := lacking("droid_jax.frames needs", "frames", "pandas"):
-        raise ImportError(told)
+    if missing := lacking("droid_jax.frames needs", "frames", "pandas"):
+        raise ImportError(missing)
     folder = path_of(folder, "the folder of a fit")
     at = next((f for f in (folder, folder / "identify") if (f / SAMPLES).is_file()), folder)
     needs_whole(at)
@@ -67,7 +68,7 @@ def _table(path: Path) -> pd.DataFrame:
 
     check_size(path, MOST_BYTES)
     table = pd.read_csv(path)
-    if not isinstance(table.index, pd.RangeIndex):  # pandas takes the first of too many cells for row names
+    if not isinstance(table.index, pd.RangeIndex):  # pandas uses surplus cells as row names
         raise ValueError(f"{path}: its rows are longer than its header")
     numeric = table.select_dtypes("number").columns
     if other := [str(column) for column in table.columns if column not in numeric]:

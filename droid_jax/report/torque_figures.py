@@ -1,4 +1,4 @@
-"""Figures of torques: joint by joint over time, and what is left between simulation and measurement."""
+"""Figures of torques or other channels: each joint over time with its residuals, and the RMS of each joint."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from droid_jax.report.text import label
 
 BUCKETS = 140  # pieces of a drawn line, and points of a band
 RESIDUAL_BUCKETS = 60  # of a line of residuals: the figure must fit into the page as SVG
-SHORT = 0.1  # of the motion; the name of a last phase below that would be cut by the panel's edge
+SHORT_PHASE = 0.1  # share of the motion; the name of a shorter last phase is not drawn, it would be cut off
 FITS = {"before": "before the fit", "after": "after the fit"}
 _STYLES: dict[str, dict[str, Any]] = {
     "before": {"color": BEFORE, "linestyle": (0, (4, 1.5))},
@@ -85,7 +85,7 @@ def torque_traces(
 
 
 def torque_grid(joints: int, width: float) -> tuple[Figure, list[Axes], list[Axes]]:
-    """A figure with two panels a joint, in the joints' order: the upper for its torque, the lower for what is left."""
+    """A figure with two panels a joint, in the joints' order: the upper for its torque, the lower for its residual."""
     columns = panel_columns(width)
     rows = math.ceil(joints / columns)
     figure = Figure(figsize=(width, 0.6 + 2.5 * rows), layout="constrained")
@@ -131,7 +131,7 @@ def distance_per_joint(
 ) -> Figure:
     """RMS difference of each joint's torque, or another quantity, [J] in `unit`, before and after the fit.
 
-    floor: what repeats differ among themselves over all joints, N m, a dashed line; floors [J]
+    floor: difference between repeats over all joints, in `unit`, a dashed line; floors [J]
     N m, the same joint by joint, small marks, where known.
     """
     figure = Figure(figsize=(width, 2.7), layout="constrained")
@@ -172,7 +172,7 @@ def shade(axes: Axes, phases: Sequence[PhaseEntry], named: bool) -> None:
         if i % 2 == 0:
             axes.axvspan(start, end, color=MUTED, alpha=0.10, linewidth=0)
         if named:
-            cut = phase is phases[-1] and end - start < SHORT * (end - phases[0].start)
+            cut = phase is phases[-1] and end - start < SHORT_PHASE * (end - phases[0].start)
             axes.text(
                 end if cut else (start + end) / 2,
                 0.98,

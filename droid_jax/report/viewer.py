@@ -1,6 +1,6 @@
 """viewer.html: measured and simulated motion side by side, one slider for time, the residuals of every joint below.
 
-A page of its own beside the report: it has a script, which the report has not, and loads nothing from elsewhere.
+A separate page, because it has a script, which the report has not.  It loads no other files.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _positions(
 
 
 def _traces(folder: Path, name: str, start: float) -> Iterator[dict[str, Any]]:
-    """What the fit compared of the recording that is replayed, if it was judged on it."""
+    """The channels that the fit compared in the replayed recording, if that recording has test data."""
     run = read_run(folder) if has_run(folder) else None
     distance = run.fit.heldout_distances.get(name) if run else None
     if run is None or distance is None:

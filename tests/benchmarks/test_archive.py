@@ -1,4 +1,4 @@
-"""Archives of scored runs: back byte for byte, held against their manifest, and scored as when they were folders."""
+"""Archives of scored runs: restored byte for byte, compared with their manifest, and scored again."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_what_was_changed_is_found(folder: Path, tmp_path: Path):
 
 
 def test_runs_of_one_kind_lie_in_one_file(folder: Path, tmp_path: Path):
-    """Each comes back by its name, also after another was packed again."""
+    """Each is restored by its name, also after another was packed again."""
     place = tmp_path / "archive"
     for name in ("null_22222ab", "null_11111ab", "null_22222ab"):
         archive.pack(folder, place, name)

@@ -1,4 +1,4 @@
-"""What single benchmark scripts make of their numbers; nothing is timed."""
+"""How benchmark scripts summarise their numbers; nothing is timed."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def test_limits_scale_with_the_effect():
 
 
 def test_a_form_that_blows_up_hides_no_limit(monkeypatch: pytest.MonkeyPatch):
-    """Its mark is NaN, with which every p would be zero and every limit the smallest."""
+    """Its score is NaN, with which every p would be zero and every limit the smallest."""
     monkeypatch.setattr(marks, "sensitivities", lambda *_: np.array([[1.0, 2.0], [np.nan, np.nan]]))
     seen: Any = SimpleNamespace(evidence=None, model=SimpleNamespace(values=None))
     np.testing.assert_array_equal(Ground.added(seen, ()), [[1.0, 2.0], [0.0, 0.0]])
@@ -233,7 +233,7 @@ def test_a_form_that_blows_up_hides_no_limit(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_limit_says_at_which_size_its_effect_was_recorded():
-    """Also where the last recording was not near enough yet."""
+    """Also where the last recording was not close enough to the limit."""
     recorded = list[float]()
 
     def hidden(effect: Applied) -> np.ndarray:
@@ -249,7 +249,7 @@ def test_a_limit_says_at_which_size_its_effect_was_recorded():
 
 
 def test_bounds_hold_what_the_base_model_absorbs():
-    """A column twice as long as a parameter may go leaves the rest, and that parameter counts as stuck."""
+    """Of a change twice as large as a parameter's range, half remains, and the parameter counts as stuck."""
     space = Space((Parameter("a", "-", 0.0, 1.0, -1.0, 1.0), Parameter("b", "-", 0.0, 1.0, -9.0, 9.0)))
     slopes = np.zeros((6, 2))
     slopes[0, 0] = slopes[1, 1] = 100.0
@@ -264,7 +264,7 @@ def test_bounds_hold_what_the_base_model_absorbs():
 
 @pytest.mark.slow
 def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hinge: Setting):
-    """Of an offset twice as large twice as much, per unit of it the same; a drift differs by repeat."""
+    """It is proportional to an offset, and differs between repeats for a drift."""
     where = ground(hinge, draw_truths(hinge, np.random.default_rng(3))["train"], 7)
     one, two = (where.hidden(Applied("torque_bias", size)) for size in (0.1, 0.2))
     assert one.shape[0] == 10 and np.abs(one).max() > 1.0
@@ -273,7 +273,7 @@ def test_what_an_effect_adds_is_taken_on_the_same_robot_with_the_same_noise(hing
 
 
 def test_the_synthetic_robot_is_no_mirror_of_the_library():
-    """Of every hidden effect at least 5 % of its own root mean square is left by the library's form of it."""
+    """The library's form of a hidden effect leaves a residual of at least 5 % of the effect's root mean square."""
     scenes = json.loads(LIMITS.read_text())["scenes"]
     assert {"hinge", "door"} <= set(scenes)
     for scene, effects in scenes.items():
@@ -503,7 +503,7 @@ def test_two_names_for_one_effect_are_not_named_alone():
 
 
 def test_an_effects_own_name_is_told_from_an_equivalents():
-    """As an effect or in a tie of it, also one of several at once; of a pair both must be there."""
+    """As an effect or as indistinguishable, also among several effects; of a pair both must be named."""
     names = [["latch", "preload"]]
     one = [
         case("single", "named", ["latch"], names),
@@ -582,7 +582,7 @@ def test_limits_of_another_run_are_refused():
 def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Scene by scene, in any order; another commit's are refused, and --quick has a summary of its own."""
+    """Scene by scene, in any order; cases of another commit are refused, and --quick has a separate summary."""
     made = list[str]()
 
     def case_of(plan: Any, commit: str, bench: Any) -> dict[str, Any]:
@@ -618,7 +618,7 @@ def test_a_null_that_was_made_in_pieces_is_summed_up_whole(
 
 
 def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.MonkeyPatch):
-    """Else those that reject, the only ones that go on, would leave the count where they fail."""
+    """Otherwise failed cases would be missing from the count of rejections, since only those continue."""
 
     def run_case(plan: Any, commit: str, bench: Any, watch: Any) -> Any:
         watch.seconds["base"] = 1.0
@@ -635,7 +635,7 @@ def test_a_null_that_fails_after_its_screening_keeps_its_p(monkeypatch: pytest.M
 
 
 def test_a_case_that_runs_out_of_memory_is_no_result(monkeypatch: pytest.MonkeyPatch):
-    """It would never be tried again."""
+    """As a result, it would never be tried again."""
 
     def run_case(*given: Any) -> Any:
         raise RuntimeError("out of memory")
@@ -667,7 +667,7 @@ def test_cases_of_two_commits_do_not_mix_where_make_was_stopped(tmp_path: Path, 
 
 
 def test_a_search_is_given_the_cases_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """No folder that the process is told of holds a seal."""
+    """No folder that the process gets contains a seal."""
     told: list[str] = []
     (tmp_path / "sealed").mkdir()
     for name in ("run_make", "run_oracle", "run_score"):
@@ -688,7 +688,7 @@ def test_what_a_killed_make_left_half_written_is_no_case(tmp_path: Path):
 
 
 def test_an_oracle_is_of_the_result_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """None without a result, none twice of the same, one more of another; a case that fails leaves its error."""
+    """Without a result there is none; each result gets one; a failed case stores its error."""
     asked: list[Any] = []
 
     def one(folder: Path, truth: Any, result: dict[str, Any], bench: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What opens the door: the parts of the pads' torque add up to the engine's, and each is what its name says."""
+"""Parts of the pads' torque: they add up to the engine's, and each has the meaning of its name."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_parts_add_up_to_the_torque_of_the_engines_contacts(pads):
 
 
 def test_a_hand_that_turns_with_the_door_opens_it_without_friction():
-    """By turning the knob between the pads: the grip's normal forces alone."""
+    """It turns the knob between the pads, by normal forces of the grip alone."""
     opening, _, _ = opened(pads_of(0.005))
     work = dict(zip(PARTS, opening.work, strict=True))
     assert opening.opened and opening.held == pytest.approx(opening.way, rel=0.05)

@@ -1,4 +1,4 @@
-"""Table II: what is summed up is what the trials were, and the intervals know policies from trials."""
+"""Table II: summaries agree with the trials, and intervals account for few policies with many trials."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ CODE = {"commit": "one"}
 def case(
     method: str, seed: int, rate: float, count: int = 50, stopped: Sequence[str] = (), fit: str = "one"
 ) -> dict[str, Any]:
-    """A policy that succeeds in so many of its trials.  stopped: why the last of them were stopped."""
+    """A policy that succeeds in some of its trials.  stopped: why the last ones were stopped."""
     won = np.arange(count) < rate * count
     why = np.array([""] * (count - len(stopped)) + list(stopped))
     found = Trials(won, np.deg2rad(np.where(won, 40.0, 10.0)), np.where(won, 100, 512), won + 0.0, why)
@@ -121,7 +121,7 @@ def test_what_blew_up_is_counted_and_in_no_rate():
 
 
 def test_policies_that_differ_widen_the_interval():
-    """A hundred trials of each say little where there are five policies: the interval is that of five draws."""
+    """With five policies of a hundred trials each, the interval is that of five draws."""
     alike = [case("mean", k, 0.5, 100) for k in range(5)]
     apart_ = [case("mean", k, float(k % 2), 100) for k in range(4)]
     narrow, wide = (column(own, "synthetic_robot")["success_interval_95"] for own in (alike, apart_))
@@ -341,7 +341,7 @@ def test_a_case_that_fails_holds_up_no_other_and_is_told(tmp_path: Path, capsys:
 
 
 def test_policies_of_different_fits_are_not_summed(tmp_path: Path):
-    """The fitted Gaussian and its mean are of one fit; the prior is another matter."""
+    """The fitted Gaussian and its mean must be of one fit; the prior belongs to none."""
     made = {"mean_0": ("fit", "one"), "fitted_0": ("fit", "one"), "prior_0": ("prior", "none")}
     planned = [
         Case(tmp_path / f"{name}.json", functools.partial(case, "mean", 0, 0.5, fit=fit), {}, doors)
@@ -410,7 +410,7 @@ def test_a_policy_that_another_process_trains_is_waited_for(tmp_path: Path):
 
 
 def test_each_policys_doors_are_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Two policies of one Gaussian would else be compared on the same doors, which then count twice."""
+    """Otherwise two policies of one Gaussian would be compared on the same doors, which would count twice."""
     module, seeds = importlib.import_module("experiments.policy_parity"), list[int]()
     found = {"difference_deg": {"largest": 1.0, "within_target": 1.0}, "angles_deg": {"mjx": [1.0], "c": [1.0]}}
     monkeypatch.setattr(module, "trained", lambda *_: (None, None, None))

@@ -148,7 +148,7 @@ def test_repeated_rows_are_left_out(experiment: Callable[[str], ModuleType]) -> 
 
 @pytest.mark.slow
 def test_where_no_spring_was_named_none_is_asked_for_again(experiment: Callable[[str], ModuleType]) -> None:
-    """It would count as not named again, of a search that was the first one once more."""
+    """Otherwise the same search would be repeated and counted as "not named again"."""
     door = experiment("gap_door")
     assert door.with_known([], lambda known: pytest.fail("searched")) is None
 

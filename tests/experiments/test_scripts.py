@@ -1,4 +1,4 @@
-"""What single scripts make of their cases, and what they keep from run to run; what does not go together is refused."""
+"""How scripts summarise their cases and keep them between runs; cases that do not belong together are refused."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def test_a_scene_that_changed_since_the_fit_is_noticed(
         assert "is another model than" in capsys.readouterr().err
         scene.unlink()
         assert main(words) == 2
-        assert "say where it is now (--scene)" in capsys.readouterr().err
+        assert "give its new path (--scene)" in capsys.readouterr().err
     finally:
         scene.write_text(text)
     assert main([*words[:2], str(logs.folder), *words[3:]]) == 2

@@ -1,4 +1,4 @@
-"""What is said of commands and torques beyond limits, and of joints that creep while friction holds them."""
+"""Findings about commands and torques beyond limits, and about joints that creep while friction holds them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from droid_jax.model.scene import Scene, compile_scene
-from droid_jax.preflight.creep import STIFF, creep_note, creep_per_load, creeping
+from droid_jax.preflight.creep import HOLDING_SOLIMP, creep_note, creep_per_load, creeping
 from droid_jax.preflight.preflight import check_range, clipped_commands, command_notes, exceeded_torques
 from droid_jax.recordings.recording import Channel, Recording, ServoGains, TorqueConvention, TorqueSide
 
@@ -74,7 +74,7 @@ def test_actuators_without_limits_have_none_to_exceed():
 
 
 def test_an_objects_angle_in_degrees_is_outside_of_its_range():
-    """It was not looked at: a door that opened by sixty degrees was taken for one that turns ten times."""
+    """Regression: the angle was not checked, and 60 degrees were read as ten turns of the door."""
     spec = hinge().spec.copy()
     door = spec.worldbody.add_body(name="door")
     door.add_joint(name="hinge", axis=[0, 0, 1], range=[0, 90], limited=mujoco.mjtLimited.mjLIMITED_TRUE)
@@ -111,7 +111,7 @@ def crept(scene: Scene, torque: float) -> float:
     [
         (0.03, 'frictionloss="0.3"', ""),
         (0.002, 'frictionloss="0.3"', ""),
-        (0.03, f'frictionloss="0.3" solimpfriction="{STIFF}"', ""),
+        (0.03, f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="0.05 1" solimpfriction=".7 .8 .001 .5 2"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="-100 -40"', ""),
         (0.03, 'frictionloss="0.3" solreffriction="0.001 1"', ""),
@@ -124,7 +124,7 @@ def test_the_speed_of_creep_is_that_of_mujoco(armature: float, joint: str, optio
 
 
 def test_a_joint_that_creeps_under_the_load_it_holds_is_said_beforehand():
-    """The field report: armature 0.03, friction loss 0.3, 0.2 N m held for ten seconds."""
+    """A case from the field: armature 0.03, friction loss 0.3, 0.2 N m held for ten seconds."""
     scene = hinge('frictionloss="0.3"')
     held = log(np.full_like(TIME, 0.2), np.full_like(TIME, 0.2), np.zeros_like(TIME))
     (creep,) = creeping(scene, held)
@@ -132,13 +132,13 @@ def test_a_joint_that_creeps_under_the_load_it_holds_is_said_beforehand():
     assert creep.speed == pytest.approx(7.04e-3, rel=0.02) and creep.distance == pytest.approx(0.070, rel=0.03)
     said = creep_note(scene, held)
     assert "j by 7 mrad/s at the 0.2 N m that it holds for 10 s (70 mrad in all" in said
-    assert f'solimpfriction="{STIFF}"' in said and said in command_notes(scene, held)
-    assert not creep_note(hinge(f'frictionloss="0.3" solimpfriction="{STIFF}"'), held)
+    assert f'solimpfriction="{HOLDING_SOLIMP}"' in said and said in command_notes(scene, held)
+    assert not creep_note(hinge(f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"'), held)
     assert not creep_note(hinge(), held)  # without friction nothing is held
 
 
 def test_of_a_scene_that_holds_it_is_said_what_its_mjcf_would_do():
-    hard = hinge(f'frictionloss="0.3" solimpfriction="{STIFF}"')
+    hard = hinge(f'frictionloss="0.3" solimpfriction="{HOLDING_SOLIMP}"')
     still = log(np.full_like(TIME, 0.2), np.full_like(TIME, 0.2), np.zeros_like(TIME))
     said = creep_note(replace(hard, held=("j",)), still)
     assert "would creep in its MJCF" in said and "j by 7 mrad/s at the 0.2 N m" in said
@@ -166,7 +166,7 @@ def test_creep_is_said_where_it_is_visible_alone():
 
 
 def test_a_servo_creeps_by_the_gain_that_the_recording_states():
-    """The scene's stiff servo was taken, which creeps too little to be seen."""
+    """Regression: the scene's stiff servo was used, which creeps too little."""
     scene = hinge('frictionloss="0.3"', actuator='<position joint="j" kp="100" kv="1"/>')
     held, torque = np.where(TIME < 4.0, 0.0, 0.3), np.where(TIME < 4.0, 0.0, 0.2)
     right = log(held, torque, np.where(TIME < 4.0, 0.0, 0.26))

@@ -1,4 +1,4 @@
-"""Wrong units, signs, orders, clocks and copies are named; what is right raises nothing."""
+"""Wrong units, signs, orders, clocks and copies are named; correct logs give no findings."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def found(r: Recording, gravcomp: bool = False) -> list[tuple[str, str]]:
 @pytest.mark.parametrize("commands", [True, False])
 @pytest.mark.parametrize("size", [SIZE, 5 * SIZE])
 def test_what_is_right_raises_nothing(gravcomp: bool, commands: bool, size: float):
-    """Masses, damping and friction are others than the scene's."""
+    """Masses, damping and friction differ from the scene's."""
     fine = recording(gravcomp, commands, size)
     assert check_log(scene(gravcomp), fine) == ()
     alone = fine.repeats_subset([0])
@@ -113,7 +113,7 @@ def test_what_is_right_raises_nothing(gravcomp: bool, commands: bool, size: floa
 @pytest.mark.parametrize("commands", [True, False])
 @pytest.mark.parametrize("size", [0.3 * SIZE, SIZE])
 def test_degrees_of_a_small_motion(commands: bool, size: float):
-    """The larger is at 14 degrees at most, below four turns of radians, and slow."""
+    """The larger position is 14 degrees at most: below four turns if it were radians, and slow."""
     findings = check_log(scene(), degrees(recording(commands=commands, size=size)))
     assert findings and findings[0].kind == "units"
     assert any("degrees" in f.sentence for f in findings)
@@ -167,7 +167,7 @@ def test_columns_in_another_order_of_a_log_without_commands(what: str):
 
 
 def test_an_order_that_fits_better_is_named_of_three_joints():
-    """Joint i holds what was recorded as joint i + 1: no exchange of two mends that."""
+    """Column i holds joint i + 1: exchanging two columns does not correct that."""
     left = {
         "a": {"a": 0.9, "b": 0.02, "c": 0.8},
         "b": {"a": 0.7, "b": 0.9, "c": 0.03},
@@ -178,7 +178,7 @@ def test_an_order_that_fits_better_is_named_of_three_joints():
 
 @pytest.mark.parametrize("size", [1.0, 200.0])
 def test_a_load_register_for_a_torque(size: float):
-    """Of the other sign, and perhaps in per mille."""
+    """With the other sign, and possibly in per mille."""
     register = of_channel("torque", lambda v: -size * v)(recording(size=5 * SIZE))
     findings = check_log(scene(), register)
     assert findings and all(f.kind == "sign" and "load register" in f.sentence for f in findings)
@@ -210,7 +210,7 @@ def test_stamps_that_are_no_seconds_and_gaps_in_them():
 
 
 def test_slow_clocks_beside_a_usual_one_are_no_milliseconds():
-    """Set-points half a second apart, and a temperature, were said to be stamped in milliseconds, certainly."""
+    """Regression: set-points half a second apart, and a temperature, were certain to be in milliseconds."""
     fine = recording()
     rows = np.arange(0.0, 11.9, 0.5)
     slow = Channel(
@@ -273,7 +273,7 @@ def turning(sent: np.ndarray, went: np.ndarray) -> Recording:
 
 @pytest.mark.parametrize("what", ["position", "command"])
 def test_an_angle_that_counts_within_one_turn(what: str):
-    """The position was said to run against its command, with the wrong sign."""
+    """Regression: the position was found to have the wrong sign."""
     signals = {"command": np.pi + 0.3 * np.sin(2 * np.pi * 0.2 * TURNING)}
     signals["position"] = np.interp(TURNING - 0.02, TURNING, signals["command"])
     assert not any(f.kind == "units" for f in check_log(wheel(), turning(signals["command"], signals["position"])))
@@ -324,7 +324,7 @@ def test_what_is_right_raises_nothing_without_torques(gravcomp: bool, size: floa
 
 
 def test_degrees_of_positions_and_commands_without_torques():
-    """The servo's torque at the tracking error would be sixty times what the arm takes."""
+    """The servo's torque at the tracking error would be sixty times that of the arm's motion."""
     (finding,) = check_log(scene(), degrees(positions_alone(recording(size=0.3 * SIZE))))
     assert finding.kind == "units" and "are these degrees?" in finding.sentence
 
@@ -340,7 +340,7 @@ def stronger(factor: float) -> Scene:
 
 @pytest.mark.parametrize("factor", [200.0, 10.0])
 def test_gains_that_the_recording_states_count(factor: float):
-    """The scene's were taken, which no replay uses: right torques were found to be wrong, certainly."""
+    """Regression: the scene's gains were used, so that correct torques were found to be wrong."""
     fine = recording(size=5 * SIZE)
     for log in (fine, positions_alone(fine)):
         assert check_log(stronger(factor), log) == ()
@@ -428,11 +428,11 @@ def test_a_torque_a_thousand_times_the_friction():
 
 
 def test_a_small_inertia_beside_friction_in_another_unit():
-    """Friction is of free size, and leaves too little for the torque to count as unexplained."""
+    """Friction is a free parameter, and the remaining torque is too small to count as unexplained."""
     heavy = hinge(mass=3.0 / 0.03)
     assert check_log(heavy, opened(1.0, 3.0, 0.05)) == ()
     (milli,) = check_log(heavy, opened(1000.0, 3.0, 0.05))
-    assert milli.kind == "units" and "of what the motion takes: are these milliamperes" in milli.sentence
+    assert milli.kind == "units" and "times what the motion needs: are these milliamperes" in milli.sentence
 
 
 def test_a_column_that_was_never_measured_is_no_dead_one():

@@ -76,7 +76,7 @@ TYPES = {
 
 
 def truth(t: float, count: int) -> dict[str, np.ndarray]:
-    """Position, velocity, effort as measured and as wanted, of so many joints."""
+    """Measured and commanded position, velocity and effort of some joints."""
     j = np.arange(1, count + 1)
     q, v = 0.1 * j + 0.2 * t * j, 0.2 * j
     return {"q": q, "v": v, "tau": j - 3.0 * t, "q_d": q + 0.01, "v_d": v + 0.02, "tau_d": 0.5 * j + t}
@@ -122,7 +122,7 @@ class Store:
 
 
 def holds(recording: Any, count: int, joints: tuple[str, ...], tolerance: float = 1e-9, commands: bool = True) -> None:
-    """The recording is `truth`, and its commands are what was wanted."""
+    """Check that the recording holds the measured and commanded values of `truth`."""
     places = slice(0, count)
     for name, key in {"position": "q", "velocity": "v", "torque": "tau"}.items():
         expected = np.stack([truth(t, count)[key][places] for t in recording.channels[name].time])
@@ -260,7 +260,7 @@ def test_places_of_joints_are_asked_for(tmp_path: Path):
 
 
 def dynamic(store: Store, joints: tuple[str, ...], fields: tuple[str, ...]) -> tuple[str, Callable[[float], Any]]:
-    """With a gripper that has a position alone, as on the same topic."""
+    """With a gripper on the same topic that has only a position."""
     keys = {"position": "q", "velocity": "v", "effort": "tau"}
 
     def make(t: float) -> Any:
@@ -322,7 +322,7 @@ def test_the_state_of_a_controller_alone(tmp_path: Path):
 
 
 def test_mcap_of_mcap_ros2_support(tmp_path: Path):
-    """A file that another library wrote than the one that reads it."""
+    """A file written by another library than the one that reads it."""
     writer = pytest.importorskip("mcap_ros2.writer")
     path = tmp_path / "a.mcap"
     line = "=" * 80

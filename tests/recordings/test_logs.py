@@ -45,7 +45,7 @@ RAD = Units(angle="rad", torque="N m", time="s")
 
 
 def check(recording: Recording, tolerance: float = 1e-9, **channels: np.ndarray) -> None:
-    """The recording holds this motion, on its clock from 0 on."""
+    """Check that the recording holds this motion, on its clock from 0 on."""
     assert recording.time == pytest.approx(TIME, abs=1e-6)
     assert recording.command == pytest.approx(COMMAND, abs=tolerance)
     assert set(recording.channels) == set(channels)
@@ -55,7 +55,7 @@ def check(recording: Recording, tolerance: float = 1e-9, **channels: np.ndarray)
 
 
 def refused(path: Path, columns: ColumnMap | Path | None = None, **options: object) -> str:
-    """What is said of a log that is refused."""
+    """The message for a log that is refused."""
     with pytest.raises(ValueError) as caught:
         load_recording(path, columns=columns, **options)
     text = str(caught.value)
@@ -119,7 +119,7 @@ def test_csv(tmp_path: Path, name: str, separator: str):
 
 
 def test_tables_as_other_programs_write_them(tmp_path: Path):
-    """An unnamed column, decimal commas, dates and a header in a comment were refused, or read as texts."""
+    """Regression: an unnamed column, decimal commas, dates and a header in a comment were refused or read as texts."""
     columns = whole(command="cmd{n}", velocity=None, torque=None, side=None, gravity=None)
     lines = log(tmp_path / "a.csv").read_text().splitlines()
     stamp = np.datetime_as_string(np.datetime64("2024-05-01T23:59:59.5") + (1e6 * TIME).astype("timedelta64[us]"))
@@ -307,7 +307,7 @@ def test_durations_count_in_their_own_unit(tmp_path: Path, unit: Literal["ms", "
 
 
 def test_a_motion_begins_where_its_first_command_finds_the_robot(tmp_path: Path):
-    """Not where the state log began, a second before, and what another file measured in part is masked elsewhere."""
+    """Not at the start of the state log, a second before; values missing in another file are masked."""
     before = np.arange(-1.0, TIME[-1], 0.01)
     state = np.stack([np.interp(before, TIME, POSITION[:, j], left=9.0) for j in range(2)], axis=1)
     state[before < -0.5] = 2.0
@@ -324,7 +324,7 @@ def test_a_motion_begins_where_its_first_command_finds_the_robot(tmp_path: Path)
 
 
 def test_what_is_measured_late_is_no_start(tmp_path: Path):
-    """A log whose measurements begin at 1 s stated their first pose as that of the first command."""
+    """Regression: measurements that begin at 1 s gave the initial position at the first command."""
     late = TIME >= 1.0
     np.savez(tmp_path / "a.npz", t=TIME, cmd=COMMAND, ts=TIME[late], q=POSITION[late])
     position = ChannelMap("q", time="ts")
@@ -345,7 +345,7 @@ def test_what_a_table_lacks_is_said_in_a_sentence(tmp_path: Path):
     assert "counts_per_turn is needed" in refused(path, whole(position=ChannelMap("q{n}", unit="counts")))
     assert "torque_constant is needed for the unit 'A'" in refused(path, whole(torque=ChannelMap("tau{n}", unit="A")))
     assert "no column of time is named" in refused(path, whole(time=None))
-    assert "does not say which of its columns are what" in refused(path)
+    assert "does not say what its columns are" in refused(path)
     hurt = log(tmp_path / "b.csv", t=np.where(np.arange(len(TIME)) == 5, np.nan, TIME))
     assert "time, row 5: expected a number, got nan" in refused(hurt, whole())
     hurt = log(tmp_path / "c.csv", cmd9=np.where(np.arange(len(TIME)) == 3, np.nan, TIME))
@@ -375,7 +375,7 @@ def test_npz_of_any_names(tmp_path: Path):
 
 
 def test_vectors_that_are_columns(tmp_path: Path):
-    """Time and powered as [T, 1], as MATLAB and t[:, None] write them, were refused."""
+    """Regression: time and powered as [T, 1], as MATLAB and t[:, None] write them, were refused."""
     np.savez(tmp_path / "a.npz", t=TIME[:, None], on=np.ones((len(TIME), 1)), cmd=COMMAND, q=POSITION[:, :1])
     columns = ColumnMap(
         joints=list(JOINTS), time="t", command="cmd", powered="on", units=RAD,
@@ -584,7 +584,7 @@ def test_currents_need_no_map_file(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_a_torque_constant_counts_once(tmp_path: Path):
-    """It was in the kept map, and was multiplied again where the command stated it again without the unit."""
+    """Regression: a constant in the kept map was applied twice if the command stated it again without the unit."""
     path, out = log(tmp_path / "a.csv"), tmp_path / "out"
     said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "torque=tau{n}", "--joints", *JOINTS]
     said += ["--units", "angle=rad", "torque=mA", "--torque", "motor", "--gravity"]
@@ -602,7 +602,7 @@ def test_a_torque_constant_counts_once(tmp_path: Path):
 
 
 def test_units_on_the_command_line_are_those_of_channels_that_state_their_own(tmp_path: Path):
-    """They were ignored there, and the numbers read in the map's unit."""
+    """Regression: they were ignored there, and numbers were read in the map's unit."""
     degrees = {
         f"{name}{10 - i}": np.degrees(v[:, 1 - i])
         for name, v in {"cmd": COMMAND, "q": POSITION}.items()
@@ -626,7 +626,7 @@ def test_units_on_the_command_line_are_those_of_channels_that_state_their_own(tm
 
 
 def test_torque_on_the_command_line_and_in_the_map(tmp_path: Path):
-    """`none` kept the torque and turned its gravity off, and so did a side that is stated again."""
+    """Regression: `none` kept the torque and changed its gravity, and so did a side that was stated again."""
     path, columns = log(tmp_path / "a.csv"), tmp_path / "servo.toml"
     write_map(whole(), columns)
 
@@ -648,12 +648,12 @@ def test_torque_on_the_command_line_and_in_the_map(tmp_path: Path):
 
 
 def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """The kept map held them, so that the next log stated the first one's."""
+    """Regression: the kept map held them, so that the next log got the gains of the first."""
     path, out = log(tmp_path / "kp200.csv"), tmp_path / "out"
     said = ["--columns", "time=t", "command=cmd{n}", "position=q{n}", "--units", "angle=rad", "--joints", *JOINTS]
     given = ["--stiffness", "20", "20", "--damping", "0", "1"]
     assert main(["convert", str(path), *said, *given, "--out", str(out / "kp200.npz")]) == 0
-    assert "but its own --stiffness and --damping: servo gains are of one log" in capsys.readouterr().out
+    assert "except --stiffness and --damping: servo gains belong to one log" in capsys.readouterr().out
     gains = load_recording(out / "kp200.npz").gains
     assert gains is not None and gains.stiffness.tolist() == [20.0, 20.0]
     assert main(["convert", str(path), "--out", str(out / "kp800.npz")]) == 0
@@ -666,7 +666,7 @@ def test_servo_gains_are_of_one_log(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_gains_in_a_kept_map_are_not_those_of_the_next_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A map of an earlier version holds some; converted twice, one log gave two recordings."""
+    """Regression: a map of an earlier version holds gains; converting one log twice gave two recordings."""
     path, out = log(tmp_path / "a.csv"), tmp_path / "out"
     write_map(whole(stiffness=[20.0, 20.0], damping=[0.0, 1.0]), out / "old.map.toml")
     for name in ("a", "b"):
@@ -743,7 +743,12 @@ def test_convert_remembers_the_map_beside_the_output(tmp_path: Path, capsys: pyt
             "/x",
         ): "--state-topic is for ROS bags",
         ("--map", "droid"): "no column 'action/joint_position'",
-        ("--map", str(out / "one.map.toml"), "--columns", "torque=tau{n}"): "maps a torque but does not say which",
+        (
+            "--map",
+            str(out / "one.map.toml"),
+            "--columns",
+            "torque=tau{n}",
+        ): "maps a torque but does not state its convention",
     }.items():
         assert main(["convert", str(first), *words, "--out", str(tmp_path / "no.npz")]) == 2
         assert error in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The recording type: what validation refuses and how it says so, the hash, subsets, windows."""
+"""The recording type: refusals of validation and their messages, the hash, subsets, windows."""
 
 from __future__ import annotations
 
@@ -376,7 +376,7 @@ def test_window_says_what_it_lacks() -> None:
         ({"meta": {"note": 3}}, "meta 'note' must be text, got 3"),
         ({"meta": []}, "meta must map texts to texts"),
         ({"known": {"payload": [2]}}, "known value of 'payload' must be a number, got [2]"),
-        ({"known": {"payload": ""}}, "what stands for 'payload'"),
+        ({"known": {"payload": ""}}, "the parameter named for 'payload'"),
         ({"known": ["payload"]}, "known must map parameter names to values or names"),
         ({"gains": (1.0, 2.0)}, "gains must be a ServoGains, got a tuple"),
         ({"channels": [1]}, "channels must map names to channels"),

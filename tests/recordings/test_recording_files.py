@@ -130,7 +130,7 @@ def test_what_lies_beside_a_recording_is_never_lost(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("where", ["door", "door.npz"])
 def test_an_irregular_clock_is_accepted_once(tmp_path: Path, where: str) -> None:
-    """Who accepted it when it was read need not do so again: `identify` and `gap` have no such option."""
+    """A clock that was accepted once need not be accepted again: `identify` and `gap` have no such option."""
     recording = make()
     time = recording.time.copy()
     time[10:] += 0.02
@@ -187,7 +187,7 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_text("x")
     fails(tmp_path / "a.bag", "pass joints and torque as well")
     save_recording(make(), tmp_path / "a.npz")
-    fails(tmp_path / "a.npz", "takes no option jonts", jonts=["j1"])
+    fails(tmp_path / "a.npz", "there is no option jonts", jonts=["j1"])
 
 
 def test_bags_without_the_package_say_what_to_install(tmp_path: Path, monkeypatch) -> None:
@@ -442,7 +442,7 @@ def test_resample_is_linear_over_the_common_part() -> None:
 
 
 def test_resampling_invents_nothing_in_a_gap() -> None:
-    """A second of silence is not a line through what was before and after it."""
+    """A gap of a second is not filled by interpolation."""
     whole = np.arange(0, 3.0, 0.01)
     holed = whole[(whole < 1.0) | (whole > 1.995)] + 0.003
     clock, out = resample([whole, holed], [np.sin(5 * t)[:, None] for t in (whole, holed)])

@@ -249,7 +249,7 @@ def test_a_whole_trajectory_in_one_message(tmp_path: Path) -> None:
 
 
 def test_a_trajectory_that_replaces_one_is_not_the_command(tmp_path: Path) -> None:
-    """What the controller followed in between is its own affair."""
+    """The topic does not show what the controller followed in between."""
     bag = Bag(tmp_path, "sqlite3")
     for t in grid(0.0, 2.5):
         bag.state(t)
@@ -262,7 +262,7 @@ def test_a_trajectory_that_replaces_one_is_not_the_command(tmp_path: Path) -> No
 
 
 def test_trajectories_may_be_sent_ahead(tmp_path: Path) -> None:
-    """What counts is when they begin by their headers, and not when they came."""
+    """Their start in the header counts, not the time of arrival."""
     bag = Bag(tmp_path, "mcap")
     for t in grid(0.0, 4.0):
         bag.state(t)
@@ -304,7 +304,7 @@ def test_repeats_are_in_the_order_of_recording(tmp_path: Path) -> None:
 
 
 def test_bags_that_overlap_keep_their_order(tmp_path: Path) -> None:
-    """Simulations that each begin at zero: nothing but a rounding says which was first."""
+    """Simulations that each begin at zero: their order differs by rounding only."""
     paths = [loaded(tmp_path, f"run_{i}", 0.001 * (11 - i)) for i in range(1, 11)]
     expected = 0.001 * (11 - np.arange(1, 11))
     for recording in (
@@ -431,7 +431,7 @@ def test_topic_errors(tmp_path: Path) -> None:
     path = pulled(tmp_path, "ros1")
     fails([path], "run.bag", "no topic '/joints'", "the bag has: /command, /joint_states", state_topic="/joints")
     fails([path], "no topic '/cmd'", "/command, /joint_states", command_topic="/cmd")
-    fails([path], "topics of their own", command_topic="/joint_states")
+    fails([path], "must come from two topics", command_topic="/joint_states")
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(tmp_path / "silent", version=9) as writer:
         writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
@@ -450,13 +450,14 @@ def test_joint_errors(tmp_path: Path, kind: str) -> None:
 
 
 def test_joints_that_messages_call_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Names with a prefix could not be matched to those of the MJCF."""
+    """Regression: names with a prefix could not be matched to those of the MJCF."""
     bag = Bag(tmp_path, "ros1")
     for t in grid(0.0, 1.0):
         for topic, prefix in {"/joint_states": "fr3_", "/goal": "fr3_", "/plain": "", "/plain_goal": ""}.items():
             bag.state(t, topic=topic, names=tuple(f"{prefix}{joint}" for joint in JOINTS))
     path = bag.write()
-    fails([path], "if 'j1' is called 'fr3_j1' there, say so for each: --joints NAME=fr3_j1, where NAME is that in")
+    advice = "give both names of each joint: --joints NAME=fr3_j1, where NAME is its name in"
+    fails([path], f"if 'j1' is called 'fr3_j1' there, {advice}")
     fails([path], "no joint j2; ", "--joints NAME=fr3_j2", joints=("fr3_j1", "j2"))
     found = read_bags([path], joints=["j1", "j2"], torque=TORQUE, state_topic="/plain", command_topic="/plain_goal")
     said = ["--torque", "link", "--gravity", "--command-topic", "/goal", "--out", tmp_path / "door.npz"]
@@ -624,7 +625,7 @@ def test_convert_takes_several_folders_of_bags(tmp_path: Path) -> None:
 
 
 def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path: Path) -> None:
-    """Bags of every motion are called alike, and a fit tells motions by their names."""
+    """Bags of every motion have the same name, and a fit distinguishes motions by their names."""
     paths = [pulled(tmp_path, "ros1", f"repeat_{i:02d}") for i in range(2)]
     said = ["--joints", *JOINTS, "--torque", "link"]
     for bags in (paths, paths[:1]):
@@ -638,7 +639,7 @@ def test_a_converted_motion_is_called_as_its_file_unless_told_otherwise(tmp_path
 
 @pytest.mark.parametrize("field", ["velocity", "position"])
 def test_what_a_driver_does_not_measure_is_masked_and_efforts_must_be_there(tmp_path: Path, field: str) -> None:
-    """joint_state_broadcaster says NaN for interfaces that are not there."""
+    """joint_state_broadcaster sends NaN for missing interfaces."""
     bag = Bag(tmp_path, "ros1", "run")
     for k, t in enumerate(grid(0.0, 1.0)):
         bag.state(t, **{field: np.full(2, np.nan) if field == "velocity" or k == 3 else position(np.array([t]))[0]})
@@ -720,7 +721,7 @@ def test_convert_says_what_a_bag_lacks(tmp_path: Path, capsys: pytest.CaptureFix
         ([*paths, *named, "--command-topic", "/nothing"], "/nothing"),
         ([], "needs the files or folders to read"),
         ([paths[0], tmp_path / "gone.npz"], "gone.npz does not exist"),
-        ([tmp_path / "log.npz", tmp_path / "log.npz"], "log.npz is no ROS bag: of several sources each is"),
+        ([tmp_path / "log.npz", tmp_path / "log.npz"], "log.npz is no ROS bag: several sources must all be"),
     ]:
         assert convert(*arguments, "--out", out) == 2
         said = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Made-up folders of searches for a missing effect, one for every verdict there is."""
+"""Made-up folders of searches for a missing effect, one for every verdict."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def make_gap(folder: Path, verdict: str = "named", test: bool = True, **changes:
 
 
 def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
-    """What a run with this verdict would leave in gap.json."""
+    """Content of gap.json of a run with this verdict."""
     effects = [LATCH] if verdict in ("named", "indistinguishable", "partly explained") else []
     left = {"partly explained": 1.9}.get(verdict, 0.0213) if effects else None
     first = {"none": 0.0161, "fit not converged": 31.5}.get(verdict, 4.213)

@@ -1,4 +1,4 @@
-"""A written page, taken apart."""
+"""Parses a written page."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, break_it: Callable[[dict[str, A
 @pytest.mark.parametrize("name", ["gap.json", "gap.npz"])
 @pytest.mark.parametrize("content", [None, b"", b"{broken", b"[]"])
 def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str, content: bytes | None) -> None:
-    """Only a search without its gap.json goes on by itself: one that has it passes for whole."""
+    """Only a search without gap.json is continued by the same command; with it, the run counts as complete."""
     folder = make_gap(tmp_path / "run")
     (folder / name).unlink()
     if content is not None:
@@ -89,7 +89,7 @@ def test_what_is_said_agrees_with_the_search() -> None:
 
 
 def test_a_log_is_drawn_in_order_of_time(tmp_path: Path) -> None:
-    """Its turns are one trace, and a cell that holds no instant is none."""
+    """Its alternating blocks are one trace, and cells without instants are not drawn."""
     folder = make_gap(tmp_path / "run", "unexplained", split=BLOCKS)
     arrays = dict(np.load(folder / "gap.npz"))
     whole = {key: arrays[f"train.{key}"] for key in ("time", "measured", "before")}

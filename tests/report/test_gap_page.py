@@ -122,7 +122,7 @@ def test_settings_and_times_are_on_the_page(made: Callable) -> None:
 
 
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
-    """Fingerprints and the start of a base fit tell whether a run may go on; on the page they would be a wall."""
+    """Hashes and the start of a base fit decide whether a run may be continued; the page does not show them."""
     asked = {"preset": "quick", "recording": ["a.npz", "b.npz"], "scene": None, "budget": 0.5}
     setup = {**asked, "command": "gap", "recordings_sha256": ["12ab"], "start": [0.1, 0.2], "synthetic_robot": False}
     gap = read_gap(make_gap(tmp_path / "run", setup=setup))
@@ -192,7 +192,9 @@ def test_a_model_that_does_worse_on_the_test_recording_is_doubted(made: Callable
     of = gap_json("named", ROLES)["discrepancies"]
     of["test"] |= {"after": 1.5 * of["test"]["before"], "closed": -0.5}
     gap, written = made("named", discrepancies=of)
-    assert "test_worse" in gap_doubts(gap) and "does worse than without" in spaced(written.doubts["test_worse"])
+    assert "test_worse" in gap_doubts(gap) and "larger with the effects than without" in spaced(
+        written.doubts["test_worse"]
+    )
     assert "50 % more" in spaced(written.text)
     assert "test_worse" not in gap_doubts(made("named")[0])
 
@@ -235,7 +237,12 @@ def test_no_share_of_nothing(tmp_path: Path, after: float) -> None:
         ("fit not converged", {}, "fit not converged", "identify --preset standard --restarts 3"),
         ("fit not converged", {"split": BLOCKS}, "fit not converged", "Next: give the parameters tighter priors"),
         ("none", {"split": BLOCKS}, "none", "a smaller effect would need repeats, a longer log"),
-        ("unexplained", {"split": BLOCKS}, "none passed", "where the most is left, noise included: joint 1"),
+        (
+            "unexplained",
+            {"split": BLOCKS},
+            "none passed",
+            "where the remaining discrepancy is largest, noise included: joint 1",
+        ),
     ],
 )
 def test_what_to_do_next(made: Callable, verdict: str, changes: dict, step: str, said: str) -> None:
@@ -264,7 +271,7 @@ def test_a_log_in_blocks_claims_nothing_that_takes_repeats(made: Callable, verdi
 
 
 def test_where_the_most_is_left(tmp_path: Path) -> None:
-    """Of all cells the test finds that of a joint's position; then none; then none is found and there are repeats."""
+    """The largest significant cell, here of a joint's position; none where no cell is significant."""
     found = gap_json("unexplained", ROLES)["cells"]
     quiet = [{**c, "found": False} for c in found["after"]]
     one = cell("position", 3.0, "panda_joint2", low=0.1, high=0.2, unit="rad")
@@ -331,7 +338,7 @@ def test_an_alternative_of_several_effects_is_one_model(made: Callable) -> None:
 
 
 def test_what_failed_by_itself_and_is_in_the_model_beside_others_is_no_contradiction(tmp_path: Path) -> None:
-    """Its interval in the final model leaves zero out, and in the model without the others it did not."""
+    """Its interval excludes zero in the final model, but not in the model without the other effects."""
     found = gap_json("named", ROLES[:2]) | {"effects": [LATCH, CLOSER], "indistinguishable": [[], []]}
     reason = {"reason": "may be zero", "text": "its coefficient may be zero (90 % interval 0 to 0.9 N m)"}
     found["validation_tests"] = [{**found["validation_tests"][0], "passed": False, "reasons": [reason]}]
@@ -354,7 +361,7 @@ def test_a_value_at_its_bound_is_said_to_lie_there(made: Callable) -> None:
 
 
 def test_a_hint_is_no_name(made: Callable) -> None:
-    """What closes a third and leaves the rest is a hint, in the next step and of its validation test."""
+    """An effect that closes only a third is a hint, in the next step and in its validation test."""
     hints = [{"effects": [LATCH], "indistinguishable": [[]], "closed": {"validation": 0.31}}]
     tests = gap_json("partly explained", ROLES[:2])["validation_tests"]
     gap, written = made("unexplained", hints=hints, validation_tests=tests)
@@ -488,7 +495,7 @@ def test_figures_survive_odd_numbers(named: Gap) -> None:
 
 
 def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> None:
-    """Of the base model, in both models alike; a curve over a joint's load says that it is that joint's."""
+    """The joint is that of the base model, for both models; a curve over load names its joint."""
     cells = named.found.cells
     joint = gap_figures.most_at(cells.before)
     loudest = max((c for c in cells.before if c.axis == "position"), key=lambda c: c.discrepancy or 0.0)
@@ -505,6 +512,6 @@ def test_position_and_load_are_shown_of_the_joint_with_the_most(named: Gap) -> N
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.filterwarnings("error")
 def test_one_parameter_has_room_for_its_axes(width: float, count: int):
-    """A scene of one parameter: a row of its own height alone left none for the axes."""
+    """A scene of one parameter: with the height of one row there was no space for the axes."""
     shifts = [Shift(f"p{k}", "kg", 1.0, 2.0, 0.4) for k in range(count)]
     gap_figures.base_shifts(shifts, width=width).savefig(io.BytesIO(), format="png")

@@ -1,4 +1,4 @@
-"""The figures of an identification draw what they are given."""
+"""The figures of an identification draw their data."""
 
 from __future__ import annotations
 

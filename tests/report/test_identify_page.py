@@ -1,4 +1,4 @@
-"""The page of an identification: what it shows equals what the run's files hold, and it says what to doubt."""
+"""The page of an identification: its numbers are those of the run's files, and it states doubts."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_truth_and_verdict_columns(written: Page) -> None:
 
 
 def test_the_result_in_mujocos_own_terms(written: Page) -> None:
-    """Each changed number with its interval and place, the lines, what no MJCF says, and how far C is."""
+    """Each changed number with interval and place, the lines, laws that MJCF lacks, and the difference from C."""
     row = "change:joint:hinge:stiffness:0"
     assert [written.cells[row, f]["values"] for f in ("before", "after", "interval")] == [
         [0.8],
@@ -284,7 +284,7 @@ def test_one_of_a_thing_is_not_several(tmp_path: Path, quick: None) -> None:
 def test_a_factor_at_its_bound_lies_beyond_it(
     changed: Callable, best: float, low: float, bound: str, said: str
 ) -> None:
-    """The servo of the robot is fifty times as stiff as the model's: the fit knows no more than that."""
+    """The robot's servo is fifty times as stiff as the model's, so that the factor ends at its bound."""
     factor = {"name": "shoulder_servo_scale", "unit": "-", "initial_mean": 1.0, "initial_std": 0.1, "low": low}
     entry = {**parameters()[4], **factor, "high": 1.5, "best": best, "on_bound": True}
     _, written = changed(lambda fit: fit["parameters"].append(entry))

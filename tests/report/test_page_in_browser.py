@@ -65,7 +65,7 @@ def gap_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of all stages, as the command without arguments leaves it."""
+    """The page of all stages, as the command without arguments writes it."""
     folder = tmp_path_factory.mktemp("browser") / "all"
     make_whole(folder)
     for part in ("identify", "gap", "train"):
@@ -83,7 +83,7 @@ def _browse(url: Path, *options: str, size: tuple[int, int]) -> subprocess.Compl
 
 
 def _console(stderr: str) -> list[str]:
-    """What the page itself complained of; a headless machine's own grumbling is not of interest."""
+    """Console messages about the page, without those about a machine without a display."""
     return [line for line in stderr.splitlines() if "CONSOLE" in line]
 
 
@@ -100,7 +100,7 @@ SIZES = pytest.mark.parametrize(
 
 
 def _probe(report: Path, size: tuple[int, int]) -> dict[str, Any]:
-    """What the browser draws of a page at this size; its console must be silent."""
+    """Measures of a page drawn by the browser at this size; its console must be empty."""
     probe, frame = report.with_name("probe.html"), report.with_name("frame.html")
     text = report.read_text(encoding="utf-8")
     opened = text.replace("default-src 'none';", "default-src 'none'; script-src 'unsafe-inline';")

@@ -1,4 +1,4 @@
-"""Progress without a terminal, in lines that a log file shows; scalars for TensorBoard, read back out of their file."""
+"""Progress without a terminal, in lines that a log file shows; scalars for TensorBoard, read back from their file."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_stages_and_training_write_lines_where_there_is_no_terminal(capsys: pyte
 
 
 def test_steps_that_are_named_are_counted_against_the_most_that_a_round_has(capsys: pytest.CaptureFixture) -> None:
-    """A text says that a step begins; the time left is that of all the others of its round."""
+    """A text announces a step; the remaining time is that of the other steps of its round."""
     times = iter([0.0, 0.0, 30.0, 60.0, 60.0, 90.0, 120.0, 120.0])
     lines = progress.Lines(clock=lambda: next(times), line=progress.Steps({"look": 4, "refit": 1}).line)
     for stage, value in (

@@ -1,4 +1,4 @@
-"""What belongs together in a folder of `all`, and which runs are whole."""
+"""Which results in a folder of `all` belong together, and which runs are complete."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_search_in_another_scene_is_left_over(tmp_path: Path):
 def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     folder = run(tmp_path, stage, last=False, files={GAUSSIAN: "of an earlier run"})
     assert unfinished(folder)
-    with pytest.raises(ValueError, match="holds a run that is not whole: run its command again"):
+    with pytest.raises(ValueError, match="holds a run that is not complete: run its command again"):
         needs_whole(folder)
     with pytest.raises(ValueError, match="run its command again"):  # and not one to run another command
         write_report(folder)
@@ -78,7 +78,7 @@ def test_a_run_is_whole_with_what_is_written_last(tmp_path: Path, stage: str):
     ],
 )
 def test_a_damaged_setup_is_said(tmp_path: Path, text: str, said: str):
-    """What was made together cannot be told from it: silence could pass an earlier run's results off as this one's."""
+    """It does not show which results belong together; those of an earlier run could be mistaken for this run's."""
     (tmp_path / "setup.json").write_text(text)
     for ask in (setup, extended_of, unfinished, needs_whole):
         with pytest.raises(ValueError, match=r"setup\.json.*start the run of this folder over with --again") as caught:

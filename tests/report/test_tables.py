@@ -37,7 +37,7 @@ def test_the_tables_of_a_fit(tmp_path: Path, below: str):
 def test_tables_of_an_earlier_run_are_not_those_of_one_that_is_not_whole(tmp_path: Path):
     pytest.importorskip("pandas")
     (fit(tmp_path) / "setup.json").write_text('{"preset": "quick"}')
-    with pytest.raises(ValueError, match="holds a run that is not whole"):
+    with pytest.raises(ValueError, match="holds a run that is not complete"):
         dj.frames(tmp_path)
     (tmp_path / "config.json").write_text("{}")
     assert len(dj.frames(tmp_path).samples) == 3
