@@ -225,7 +225,7 @@ def in_windows(
     cut_to = (a[kept] for a in (values, at, _nearest(at, clocks, drive), unit))
     stated = functools.partial(space.with_known, drive.known)
     stated(space.mean)  # refused here, not at the first call
-    return Piece(_name(recording, repeat), made.kept(kept), program, kernels, {}, columns, *cut_to, stated=stated)
+    return Piece(_name(recording, repeat), made.subset(kept), program, kernels, {}, columns, *cut_to, stated=stated)
 
 
 def as_a_whole(

@@ -51,7 +51,7 @@ FLAT = 1e-6  # share of the largest of a body's three extents squared that each 
 # ----- moments one by one
 
 
-def free_inertias(scene: Scene, space: Space) -> dict[int, list[tuple[int, Write]]]:
+def free_inertias(space: Space) -> dict[int, list[tuple[int, Write]]]:
     """Body -> (column of the vector, write) of its inertia, of those bodies whose moments do not scale as one."""
     writes = dict[int, list[tuple[int, Write]]]()
     for column, parameter in enumerate(space.parameters):
@@ -65,7 +65,7 @@ def free_inertias(scene: Scene, space: Space) -> dict[int, list[tuple[int, Write
 def inertia_possible(scene: Scene, space: Space, values: Any) -> Any:
     """[...] bool of values [..., D], numpy or jax: whether every body's inertia is one that a body can have."""
     found = None
-    for body, writes in free_inertias(scene, space).items():
+    for body, writes in free_inertias(space).items():
         first, second, third = _moments(scene, body, writes, lambda column: values[..., column])
         total = first + second + third
         fits = (2 * first <= total * (1 + ROUNDING)) & (2 * second <= total * (1 + ROUNDING))
@@ -79,7 +79,7 @@ def check_inertia(scene: Scene, space: Space) -> None:
 
     The message names the body, its parameters and the moments.
     """
-    for body, writes in free_inertias(scene, space).items():
+    for body, writes in free_inertias(space).items():
         names = ", ".join(dict.fromkeys(space.parameters[column].name for column, _ in writes))
         called = f"body {scene.model.body(body).name!r} of scene {scene.name!r}"
         means = _moments(scene, body, writes, lambda column: space.mean[column])

@@ -245,7 +245,7 @@ def test_torques_that_hold_no_weight_are_left_out_of_an_evaluation(logs: SimpleN
     assert set(whole.errors) == {"torque", "position"} and set(found.errors) == {"position"}
     assert found.errors["position"] == whole.errors["position"] and found.recording.sha256 == light.sha256
     alone = replace(light, channels={"torque": light.channels["torque"]})
-    with pytest.raises(ValueError, match="says that its torque holds no weight"):
+    with pytest.raises(ValueError, match="says that its torque excludes gravity"):
         evaluate_on(scene, space, alone, **of)
 
 

@@ -105,5 +105,7 @@ def test_c_compensates_by_the_joint_and_says_so():
         "still", clock, np.zeros((len(clock), 2)), scene.joints, {"torque": torque}, convention, start
     )
     space = Space((joint_encoder_offset(scene, "elbow", std=0.02, high=0.1),))
-    with pytest.raises(ValueError, match="compensates gravity where joints are, not where encoders say; use MJX"):
+    with pytest.raises(
+        ValueError, match="compensates gravity at the true joint positions, not at those that encoders read; use MJX"
+    ):
         make_cost(scene, space, [recording], engine="mujoco").distances(space.mean[None])

@@ -119,7 +119,7 @@ def test_a_log_without_commands_warns_of_a_loop_that_it_leaves_out():
     log = recording(
         joints=(), command=np.zeros((0, 0)), time=np.zeros(0), channels={"torque": torque, "position": position}
     )
-    with pytest.warns(UserWarning, match=r"a prescribed motion leaves <connect> 'pin' of scene 'four-bar' out"):
+    with pytest.warns(UserWarning, match=r"the replay ignores <connect> 'pin' of scene 'four-bar'"):
         assert prescribed(four_bar(), log) == ("crank",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -160,7 +160,7 @@ def test_a_base_in_balance_is_held_by_nothing_either():
     """Its centre is in the joint: it stands, until the first command turns it."""
     scene = leg(joint='<joint name="socket" type="ball" damping="1"/>')
     scene.model.opt.gravity[:] = 0
-    with pytest.raises(ValueError, match=r"the ball joint socket.* whatever the commands do moves it"):
+    with pytest.raises(ValueError, match=r"the ball joint socket.* every command moves it"):
         make_drive(scene, recording())
 
 
@@ -198,6 +198,6 @@ def test_a_urdf_without_servos_says_where_to_add_them(tmp_path: Path):
     parts += [joint.format("crank", "base", "a", ""), joint.format("finger", "a", "b", '<mimic joint="crank"/>')]
     file = tmp_path / "arm.urdf"
     file.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
-    said = "a URDF holds none: save it as MJCF and add them there; its 1 <mimic> became"
+    said = "a URDF has none: save it as MJCF and add them there; its 1 <mimic> became"
     with pytest.raises(ValueError, match=said):
         make_drive(load_scene(file, joints=["crank"]), recording())

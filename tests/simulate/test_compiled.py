@@ -72,7 +72,7 @@ def test_other_commands_starts_and_bounds_share_a_program(
     other = torque(made(scene, slower, effect, high=5.0))
     assert count and len(traced) == count
     assert np.abs(other - first).max() > 0.1
-    monkeypatch.setattr(compiled, "SHORTEST", 1)
+    monkeypatch.setattr(compiled, "MIN_ROWS", 1)
     assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
     own = list[float]()
     alone = torque(made(scene, slower, pull(0.0, own)))

@@ -161,7 +161,7 @@ def test_commands_of_an_actuator_without_position_feedback_are_said_to_be_torque
 
 def test_a_start_that_would_be_a_guess_is_refused():
     driven = motors()
-    with pytest.raises(ValueError, match="does not tell where shoulder starts"):
+    with pytest.raises(ValueError, match="does not say where shoulder starts"):
         make_drive(driven, recording(qpos0={}, gains=None))
     started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
     np.testing.assert_allclose(started.qpos0, [0.25, 0.25])

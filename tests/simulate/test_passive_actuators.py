@@ -138,7 +138,7 @@ def test_a_motor_without_a_command_is_given_nothing_and_that_is_said():
     assert left_alone(arm, recording()) == (
         "recording 'wave' has not all commands: grip held where the motion starts; thumb given 0 (no position feedback)"
     )
-    with pytest.raises(ValueError, match="does not tell where thumb starts"):  # commanded, and a torque tells no place
+    with pytest.raises(ValueError, match="does not say where thumb starts"):  # a commanded torque gives no position
         make_drive(arm, replace(recording(thumb=np.zeros(len(TIME))), qpos0={"shoulder": 0.2}))
 
 

@@ -324,7 +324,7 @@ def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
 @pytest.mark.slow
 def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none():
     heavy = arm(gravcomp=False)
-    with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
+    with pytest.raises(ValueError, match=r"'wave' says that its torque excludes gravity.*shoulder, elbow.*gravcomp"):
         make_drive(heavy, recording())
     torque = replayed(TorqueConvention(TorqueSide.MOTOR, gravity=True), gravcomp=False)
     np.testing.assert_allclose(torque.torque[0], servo_torque(torque.position[0], 0.0), atol=2e-5)
@@ -447,7 +447,7 @@ def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
     with pytest.raises(ValueError, match="effects depend on the state: kick"):
         c_replay(scene, SPACE, drive, [kick])
     for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
-        with pytest.raises(ValueError, match="its torque is the actuators': motor-side"):
+        with pytest.raises(ValueError, match="it gives actuator torques: motor-side"):
             c_replay(scene, SPACE, replace(drive, torque=convention))
 
 
@@ -533,7 +533,7 @@ def test_damping_that_is_not_stated_is_the_scenes():
 
 
 def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
-    assert "of elbow not the stated damping is used" in gains_note(
+    assert "for elbow it uses the joint's damping, not the stated one" in gains_note(
         scene, recording(gains=ServoGains(np.array([90.0, 25.0]), np.array([3.0, 7.0])))
     )
 

@@ -216,7 +216,7 @@ def test_these_are_all_effects(scene: Scene):
 @pytest.mark.parametrize("name", STEERING)
 def test_what_steers_is_refused_by_name(scene: Scene, name: str):
     given = prescribed(scene, MOTOR, True)
-    with pytest.raises(ValueError, match=rf"no commands that an effect could change: {name}$"):
+    with pytest.raises(ValueError, match=f"effects {name} change commands, which a prescribed motion"):
         inverse_replay(scene, given, library(scene, ["drag", name, "torque_bias"]))
 
 
