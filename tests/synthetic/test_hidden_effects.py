@@ -22,7 +22,7 @@ from droid_jax.recordings.recording import Channel, Recording, TorqueConvention,
 from droid_jax.simulate.c_engine import instrument
 from droid_jax.synthetic import arm_effects, friction_effects, hinge_effects, hooks
 from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, hidden_effect, possible, record_hidden
-from droid_jax.synthetic.hooks import Influence, Live, Place, Seen
+from droid_jax.synthetic.hooks import Influence, Live, Place, SensorInput
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
 # A two-link arm and a servo-driven flap with a knob that the arm never touches.
@@ -654,7 +654,7 @@ def test_a_ramp_comes_as_late_as_said():
 
 def test_signals_by_hand(scene: Scene):
     clock, torque = np.array([0.0, 60.0]), np.array([[1.0, -20.0, 2.0], [0.5, 40.0, 2.0]])
-    seen = Seen(clock, torque, np.full((2, 3), math.pi / 2))
+    seen = SensorInput(clock, torque, np.full((2, 3), math.pi / 2))
 
     def sensed(name: str, amplitude: float, repeat: int = 0) -> np.ndarray:
         after = made(scene, name, amplitude, ("shoulder",), repeat).sense(seen)  # type: ignore[misc]

@@ -28,7 +28,7 @@ from droid_jax.recordings.recording import TorqueSide
 from droid_jax.synthetic import policy_trials as module
 from droid_jax.synthetic.hidden_effects import Applied, record_hidden
 from droid_jax.synthetic.policy_trials import TransferConfig, _senses, _trial, filmed, synthetic_robot, transfer
-from droid_jax.synthetic.robot import DRIFT_TIME, SyntheticRobotConfig, _torque_noise, set_up, synthetic_truth
+from droid_jax.synthetic.robot import SyntheticRobotConfig, _torque_noise, set_up, synthetic_truth
 
 QUIET = SyntheticRobotConfig(
     repeats=2, timestep=0.00025, torque_noise=(1e-3, 1e-3), torque_drift=(0.0, 0.0), start_noise=0.0, pose_noise=0.0
@@ -59,7 +59,7 @@ def test_noise_and_drift_are_as_large_as_they_say_at_arm_and_wrist():
     config = SyntheticRobotConfig(torque_noise=(0.0, 0.0), torque_drift=(0.04, 0.01))
     drift = _torque_noise((4, 200000, 7), config, np.random.default_rng(1))
     np.testing.assert_allclose(drift.std(axis=(0, 1)), [0.04] * 4 + [0.01] * 3, rtol=0.05)
-    lag = round(DRIFT_TIME * config.rate)
+    lag = round(config.drift_time * config.rate)
     kept = np.mean(drift[:, lag:] * drift[:, :-lag], axis=(0, 1)) / drift.var(axis=(0, 1))
     np.testing.assert_allclose(kept, np.exp(-1), atol=0.06)
 
@@ -105,7 +105,7 @@ def test_the_link_side_of_dry_friction_in_the_model_is_not_known():
     scene, space = small_scene()
     rubs = copy.copy(scene.model)
     rubs.dof_frictionloss[scene.dof("elbow")] = 0.5
-    with pytest.raises(ValueError, match=r"link side of joints with a frictionloss of their own \(elbow"):
+    with pytest.raises(ValueError, match=r"link-side torques of joints with a frictionloss \(elbow"):
         config = replace(QUIET, side=TorqueSide.LINK)
         set_up(replace(scene, model=rubs), demonstration("train"), TRUTH, seed=3, config=config, space=space)
 
@@ -182,7 +182,7 @@ def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, comman
 
 def test_a_policy_of_another_rate_is_refused(scene, start, commands):
     robot = synthetic_robot(scene, start, {}, (), replace(TASK, control=0.04), ONE)
-    with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task asks every 0.04 s"):
+    with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task every 0.04 s"):
         transfer(Script(TASK, commands, interface_of(scene, TASK, start)), robot)  # type: ignore[arg-type]
 
 
