@@ -19,7 +19,7 @@ from brax.envs.base import Env, State
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load_policy
 from droid_jax.policy.export import CLOSE, difference, export, to_onnx
-from droid_jax.policy.parallel import AXIS, Doors, wrapped
+from droid_jax.policy.parallel import AXIS, RandomisedEnvs, wrapped
 from droid_jax.storage import WRITTEN
 
 onnx = pytest.importorskip("onnx")
@@ -121,7 +121,7 @@ def randomise(sys: Physics, rng) -> tuple[Physics, Any]:
     return Physics(jax.vmap(jax.random.uniform)(rng), sys.gravity), Physics(0, None)
 
 
-def stiffnesses(doors: Doors, devices: int, act: bool) -> np.ndarray:
+def stiffnesses(doors: RandomisedEnvs, devices: int, act: bool) -> np.ndarray:
     """[devices, COUNT] what the environments of each device see at reset, or after a step."""
 
     def run(rng):
@@ -138,15 +138,19 @@ def stiffnesses(doors: Doors, devices: int, act: bool) -> np.ndarray:
 def test_every_environment_of_every_device_has_its_own_physics(act: bool):
     assert jax.local_device_count() >= 2
     env = Spring()
-    found = stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act)
+    found = stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act)
     assert len(np.unique(found)) == 2 * COUNT
-    np.testing.assert_array_equal(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act), found)
-    assert not np.intersect1d(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(2)), 2, act), found).size
+    np.testing.assert_array_equal(
+        stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act), found
+    )
+    assert not np.intersect1d(
+        stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(2)), 2, act), found
+    ).size
     assert env.sys is Spring.sys  # as it was
 
 
 def test_outside_of_braxs_devices_there_is_one():
-    doors = Doors(Spring(), randomise, COUNT, 2, jax.random.PRNGKey(1))
+    doors = RandomisedEnvs(Spring(), randomise, COUNT, 2, jax.random.PRNGKey(1))
     alone = jax.jit(doors.reset)(jax.random.split(jax.random.PRNGKey(0), COUNT)).obs[:, 2]
     np.testing.assert_array_equal(alone, doors.physics.stiffness[:COUNT])
 

@@ -72,7 +72,7 @@ def test_networks_come_back_from_a_tree_and_others_are_refused():
     ("changes", "said"),
     [
         ({"envs": 33}, "must be a multiple of the 33 environments"),
-        ({"devices": 99}, "99 devices were asked for, there are"),
+        ({"devices": 99}, "99 devices were requested, there are"),
         ({"devices": 0}, "devices must be at least 1, got 0"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"evaluations": 0}, "evaluations must be at least 1, got 0"),
@@ -101,10 +101,10 @@ def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, d
     assert _devices(PRESETS[preset]) == min(devices, PRESETS[preset].batch)
 
 
-def test_the_time_left_is_what_the_rest_takes_at_this_rate():
+def test_the_remaining_time_follows_from_the_rate():
     now = TrainProgress(step=1000, of=4000, seconds=9.0, rate=0.0, reward=0.0, success=0.0)
-    assert replace(now, rate=150.0).left == 20.0 and now.left == float("inf")
-    assert replace(now, rate=150.0, step=4096).left == 0.0  # whole rounds may be more than was asked for
+    assert replace(now, rate=150.0).remaining == 20.0 and now.remaining == float("inf")
+    assert replace(now, rate=150.0, step=4096).remaining == 0.0  # whole rounds may be more than was asked for
 
 
 def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:
@@ -138,12 +138,12 @@ def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: 
 
 
 def test_the_rate_counts_the_evaluations_too(monkeypatch: pytest.MonkeyPatch):
-    """The time left was that of the training alone, as brax gives it."""
+    """brax's own rate leaves them out."""
     played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.0, 5.0, 1.0), (300, 0.0, 8.0, 2.0))
     clock = iter([2.0, 12.0, 32.0, 52.0])
     monkeypatch.setattr("droid_jax.policy.train.time", SimpleNamespace(monotonic=lambda: next(clock)))
     found = _brax(MADE_UP, None, replace(SHORT, steps=400), None, 0, lambda now: None, lambda step, tree: None)
-    assert [(now.rate, now.left) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
+    assert [(now.rate, now.remaining) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
 
 
 @pytest.mark.parametrize("evaluations", [2, 8, 16])
