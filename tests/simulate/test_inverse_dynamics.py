@@ -321,7 +321,7 @@ def test_a_joint_that_is_not_in_the_log_stands_where_it_is_stated():
         np.gradient(np.asarray(rollout.position)[0, :, 0], rollout.time[0]), rollout.time[0]
     )
     np.testing.assert_allclose(np.asarray(rollout.torque)[0, 5:-5, 0], (weight + inertia)[5:-5], atol=0.01)
-    with pytest.warns(UserWarning, match="stand still as in the scene"):
+    with pytest.warns(UserWarning, match="holds them still as in the scene"):
         make_cost(scene, space, [standing({})])
     with pytest.raises(ValueError, match="unknown joint 'waist'"):
         make_cost(scene, space, [standing({"torso": 0.7, "waist": 1.0})]).rollouts(np.zeros((1, 1)))
