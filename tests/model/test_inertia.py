@@ -57,7 +57,7 @@ def moment(scene: Scene, column: int, **more: float) -> Parameter:
 
 def test_bounds_that_no_body_can_have_are_said(scene: Scene):
     with pytest.warns(
-        UserWarning, match=r"the bounds of i0 hold moments that body 'a' of scene 'arm' cannot have \(0\.5"
+        UserWarning, match=r"the bounds of i0 allow moments that body 'a' of scene 'arm' cannot have \(0\.5"
     ):
         check_inertia(scene, Space((moment(scene, 0),)))
     narrow = Space(tuple(moment(scene, k, low=0.003, high=0.006) for k in range(3)))

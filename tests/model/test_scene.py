@@ -449,8 +449,14 @@ def test_actuators_of_which_none_is_the_joints_own_go_by_their_own_names(actuato
 @pytest.mark.parametrize(
     ("actuators", "said"),
     [
-        ('<position joint="j"/><velocity joint="j" kv="1"/>', "actuator 1 has another one beside it: give it a name"),
-        ('<position joint="j"/><velocity name="k" joint="j"/>', "'k' has another one beside it: give it a name that"),
+        (
+            '<position joint="j"/><velocity joint="j" kv="1"/>',
+            "actuator 1 shares its joint with another one: give it a name",
+        ),
+        (
+            '<position joint="j"/><velocity name="k" joint="j"/>',
+            "'k' shares its joint with another one: give it a name that",
+        ),
     ],
 )
 def test_actuators_beside_a_servo_need_names(actuators: str, said: str):
