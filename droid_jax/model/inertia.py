@@ -17,8 +17,8 @@ triangular), ten numbers z give another one, J(z) = U0 A(z) A(z)' U0', where A i
                 [0,           0,           0,           1      ]]
 
 z = 0 is the scene's body.  A shift of 1 moves the centre of mass by about a radius of gyration; mass 0.05 is 10 %
-heavier.  Parameters write the numbers to a field `body_pseudo_inertia` [nbody, 10], which no MuJoCo model has.  Applying
-values converts it to mass, centre of mass, orientation and moments (`inertial_fields`).
+heavier.  Parameters write the numbers to a field `body_pseudo_inertia` [nbody, 10], which no MuJoCo model has.
+Applying values converts it to mass, centre of mass, orientation and moments (`inertial_fields`).
 
 Source: Rucker and Wensing, Smooth parameterization of rigid-body inertia, IEEE RA-L 2022.
 """
