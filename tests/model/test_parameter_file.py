@@ -196,7 +196,7 @@ def test_a_parameter_of_each_is_what_entries_of_their_own_make(tmp_path: Path):
         expected = [loaded(tmp_path, scene, one).parameters[0] for one in apart]
         assert list(loaded(tmp_path, scene, together).parameters) == expected
     for wrong in ({"element": "elbow"}, {"element": []}):
-        with pytest.raises(ValueError, match='"each" is of a list of elements; element is'):
+        with pytest.raises(ValueError, match='"each" needs a list of elements; element is'):
             loaded(tmp_path, scene, {**GOOD, **wrong, "each": True})
 
 
@@ -205,7 +205,7 @@ def test_a_parameter_of_each_is_what_entries_of_their_own_make(tmp_path: Path):
     [
         ({"field": "dof_damping"}, 'elbow_damping is 1 in the model and wrist_damping is 2: state the mean .*"scale"'),
         ({"sensor": "coulomb"}, "a sensor's term belongs to one joint"),
-        ({"field": "dof_damping", "element": []}, "an empty list names nothing"),
+        ({"field": "dof_damping", "element": []}, "element: the list is empty"),
         ({"field": "dof_damping", "element": ["elbow", "knee"]}, "unknown joint 'knee'"),
     ],
 )
@@ -229,7 +229,7 @@ def test_an_entry_like_another_stands_for_it(tmp_path: Path, scene: Scene):
     assert (old.unit, old.low, old.high, old.mean) == (oil.unit, oil.low, oil.high, oil.mean)
     assert (old.std, old.writes, old.role) == (0.2, (), Role.STANDS_FOR) and oil.writes
     for entry, said in (
-        ({"like": "grease", "name": "old"}, "no entry before it has the name 'grease'; there: oil"),
+        ({"like": "grease", "name": "old"}, "no entry before it has the name 'grease'; names are: oil"),
         ({"like": "oil"}, "missing name"),
         ({"like": "oil", "name": "old", "column": 1}, "leave column out"),
     ):

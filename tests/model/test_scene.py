@@ -393,7 +393,7 @@ def test_a_body_may_weigh_by_its_looks_alone(compiler: str):
 def test_what_mjx_has_not_is_said_in_a_sentence(option: str):
     xml = f"""<mujoco><option {option}/><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
       <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
-    with pytest.raises(ValueError, match="scene 'new' uses something that MJX has not"):
+    with pytest.raises(ValueError, match="scene 'new' uses something that MJX does not support"):
         compile_scene(mujoco.MjSpec.from_string(xml), "new", engine="mujoco").mjx  # noqa: B018
 
 
