@@ -192,6 +192,6 @@ DOOR = (
     Hidden("tilted_frame", "rad", (0.02, 0.15), "hinge", hide_tilted_frame, "the frame is out of plumb", signed=True),
     Hidden("detent", "N m", (0.3, 1.5), "hinge", hinge_torque(detent), "a ball detent half-way; in no library"),
     Hidden("pin_wobble", "N m", (0.2, 1.5), "hinge", hinge_loss(pin_wobble), "a bent hinge pin; in no library"),
-    Hidden("gasket", "N m", (0.3, 2.0), "hinge", hide_gasket, "a seal that sucks; in no library"),
+    Hidden("gasket", "N m", (0.3, 2.0), "hinge", hide_gasket, "a seal that holds by suction; in no library"),
     Hidden("neighbour_door", "N m", (0.1, 0.5), "hinge", hinge_torque(neighbour_door), "another door; in no library"),
 )
