@@ -139,7 +139,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
 @register
 def joint_backlash(scene: Scene) -> Effect | None:
-    """The motor is ahead of the link by half the backlash, rad, in the direction of the torque; in between it is zero."""
+    """The motor is ahead of the link by half the backlash, rad, in the direction of the torque, if there is any."""
     servos = _servos(scene)
     if servos is None:
         return None
