@@ -24,7 +24,7 @@ from droid_jax.simulate.batching import block_size
 from droid_jax.simulate.compiled import window_program
 from droid_jax.simulate.replay import Drive, end_on
 from droid_jax.simulate.servo_gains import servo_factors
-from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
+from droid_jax.simulate.windows import WindowConfig, Windows, cut_windows, start_spread
 
 STRETCH = 0.5  # s: what a motion that is replayed whole is divided into, as others are into windows
 LONGER = 1.25  # times its own duration that a motion is replayed for, to share a program and a batch with longer ones
@@ -211,7 +211,7 @@ def in_windows(
     """A repeat in windows, without those in which something was not measured; see `windowed_log`.  None: in all."""
     if any(effect.profile is not None for effect in effects):
         windows = replace(windows, history=max(windows.history, windows.past))
-    made = cut(scene, recording, drive, repeat, windows, grid, number)
+    made = cut_windows(scene, recording, drive, repeat, windows, grid, number)
     if not len(made.begin):
         return None
     instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate

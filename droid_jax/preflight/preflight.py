@@ -13,7 +13,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.closed_loops import OPEN, open_loops
-from droid_jax.simulate.initial_state import sent_columns, sent_to, stated_start
+from droid_jax.simulate.initial_state import command_columns, commanded_positions, stated_start
 from droid_jax.simulate.servo_gains import gains_note
 
 BEGINNING = 0.02  # s (six rows at least), in which the speed at the start is looked at
@@ -146,7 +146,7 @@ def check_range(scene: Scene, recording: Recording) -> None:
     One that is outside by more than BEYOND of its range is warned of, and a hinge without a range, which may be a
     wheel, where it goes more than TURNS from its zero.
     """
-    sent = sent_to(scene, recording) if recording.command.size else {}
+    sent = commanded_positions(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
     paths += [("starts at", joint, np.array([q])) for joint, q in recording.qpos0.items()]
     if channel := recording.channels.get("position"):
@@ -204,7 +204,7 @@ def clipped_commands(scene: Scene, recording: Recording) -> str:
     if not recording.command.size or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         return ""
     said = []
-    for actuator, column in sent_columns(scene, recording).items():
+    for actuator, column in command_columns(scene, recording).items():
         if not model.actuator_ctrllimited[actuator]:
             continue
         low, high = model.actuator_ctrlrange[actuator]

@@ -8,7 +8,7 @@ import numpy as np
 
 from droid_jax.preflight.findings import Finding
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate.repeat_starts import spread
+from droid_jax.simulate.repeat_starts import start_ranges
 
 COPY = 1e-6  # of a channel's size: repeats that differ by less were measured once (float32 rounds by less)
 LEVELS = 8  # a column that moves and takes no more different values is coarse
@@ -84,7 +84,7 @@ def _span(channel: Channel, column: int) -> float:
 
 def _apart(recording: Recording, where: str) -> list[Finding]:
     """How far apart the repeats start, where that is visible."""
-    apart = spread(recording)
+    apart = start_ranges(recording)
     if not apart:
         return []
     most = max(apart, key=lambda joint: apart[joint])

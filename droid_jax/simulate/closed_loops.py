@@ -64,7 +64,7 @@ def open_loops(scene: Scene, qpos: np.ndarray) -> list[Loop]:
     return sorted(found, key=lambda loop: -loop.turn)
 
 
-def closed(scene: Scene, qpos: np.ndarray, fixed: Iterable[int]) -> np.ndarray:
+def close_loops(scene: Scene, qpos: np.ndarray, fixed: Iterable[int]) -> np.ndarray:
     """[nq] the pose in which the free joints come closest to satisfying the scene's equalities.
 
     Gauss-Newton moves the free joints, in STAGES from the scene's reference pose, whose loops the compiler closed.

@@ -34,10 +34,10 @@ from droid_jax.simulate.replay import (
     TORQUE_OFFSETS,
     Drive,
     Replay,
-    sensed,
     servo_motion,
     torque_offset_effect,
     traced_part,
+    with_sensor_model,
 )
 from droid_jax.simulate.servo_gains import check_gains
 
@@ -199,7 +199,7 @@ def _window_program(
     def replay(values: jax.Array, table: Any, start: Any, gains: Any, speed: Any, origin: Any) -> Rollout:
         physics = make_physics(scene, space, values)
         moved = motion(physics, table, start, gains, steps, speed, origin)
-        return sensed(moved, physics.theta, effects, clocked.timestep, origin=origin)
+        return with_sensor_model(moved, physics.theta, effects, clocked.timestep, origin=origin)
 
     return over_block(_of_bodies(scene, space, replay), shared=False)
 
@@ -263,7 +263,7 @@ def _sensors(
     space = layout.space
 
     def sense(values: jax.Array, motion: Rollout) -> Rollout:
-        return sensed(motion, theta_of(space, values), effects, timestep, steps)
+        return with_sensor_model(motion, theta_of(space, values), effects, timestep, steps)
 
     return over_block(_of_bodies(scene, space, sense), shared=False)
 

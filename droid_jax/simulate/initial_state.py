@@ -14,7 +14,7 @@ from droid_jax.arguments import check_fields, number
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.closed_loops import OPEN, closed, moved_by_loops, open_loops
+from droid_jax.simulate.closed_loops import OPEN, close_loops, moved_by_loops, open_loops
 
 WEIGHT = 0.01  # N m or N, uncompensated weight below this counts as none (the smallest noise that `cost` assumes)
 POSES = 50  # of a motion, at which the weight is computed
@@ -77,7 +77,7 @@ def start_pose(scene: Scene, recording: Recording, config: StartConfig = DEFAULT
             f"recording {recording.name!r} does not say where {', '.join(guessed)} starts: state it in qpos0 "
             "or measure its position"
         )
-    qpos = closed(scene, _coupled(scene, stated), [scene.qpos(joint) for joint in stated])
+    qpos = close_loops(scene, _coupled(scene, stated), [scene.qpos(joint) for joint in stated])
     if wide := [loop for loop in open_loops(scene, qpos) if loop.turn > OPEN]:
         raise ValueError(
             f"recording {recording.name!r} starts where {wide[0].name} of scene {scene.name!r} is open by "
@@ -94,7 +94,7 @@ def stated_start(scene: Scene, recording: Recording) -> np.ndarray:
 
 def _stated(scene: Scene, recording: Recording, config: StartConfig) -> dict[str, float]:
     """Joint -> initial position, rad or m, of the joints whose start the recording contains."""
-    sent = {joint: path[0] for joint, path in sent_to(scene, recording).items()}
+    sent = {joint: path[0] for joint, path in commanded_positions(scene, recording).items()}
     return {**sent, **_measured(scene, recording, config.ajar), **recording.qpos0}
 
 
@@ -117,7 +117,7 @@ def _coupled(scene: Scene, stated: Mapping[str, float]) -> np.ndarray:
     return qpos
 
 
-def following(scene: Scene, qpos: np.ndarray) -> set[int]:
+def coupled_addresses(scene: Scene, qpos: np.ndarray) -> set[int]:
     """Position addresses of unmeasured joints whose position in a pose [nq] an equality determines."""
     model = scene.model
     measured = {scene.qpos(j) for j in (*scene.joints, *([scene.object_joint] if scene.object_joint else []))}
@@ -155,7 +155,7 @@ def check_weight(scene: Scene, recording: Recording, qpos0: np.ndarray) -> None:
         )
 
 
-def holding(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
+def holding_controls(scene: Scene, qpos0: np.ndarray) -> np.ndarray:
     """[U] the controls at which actuators with position feedback exert no force at rest in a pose [nq]; else 0.
 
     Such an actuator's force is gain * control + b0 + b1 * length + b2 * velocity, as that of a position servo.  The
@@ -200,18 +200,18 @@ def _poses(scene: Scene, recording: Recording, qpos0: np.ndarray) -> np.ndarray:
     """[POSES, nq] poses along the commanded motion; joints without position servos stay at the start."""
     poses = np.tile(qpos0, (POSES, 1))
     rows = np.linspace(0, len(recording.time) - 1, POSES).round().astype(int)
-    for joint, path in sent_to(scene, recording).items():
+    for joint, path in commanded_positions(scene, recording).items():
         poses[:, scene.qpos(joint)] = path[rows]
     return poses
 
 
-def sent_columns(scene: Scene, recording: Recording) -> dict[int, int]:
+def command_columns(scene: Scene, recording: Recording) -> dict[int, int]:
     """Index of each commanded actuator -> column of the recording's command."""
     columns = scene.command_index(recording.command_names)
     return {int(u): int(columns[u]) for u in np.flatnonzero(columns >= 0)}
 
 
-def sent_to(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
+def commanded_positions(scene: Scene, recording: Recording) -> dict[str, np.ndarray]:
     """Joint -> commanded positions [T] of its position servo, rad or m; motors are left out."""
     model = scene.model
     kp, position_gain, gear = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_gear[:, 0]

@@ -27,7 +27,7 @@ from droid_jax.simulate.measured_motion import CUTOFF, Motion, measured_througho
 from droid_jax.simulate.replay import apply_sensor_model
 
 
-def prescribed(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
+def prescribed_joints(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
     """The joints whose measured motion a replay prescribes: the scene's, then all others measured throughout.
 
     Only torques of the scene's joints are compared, but other joints that move act on them.  Joints that are not

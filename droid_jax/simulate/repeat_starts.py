@@ -15,7 +15,7 @@ from droid_jax.simulate.initial_state import DEFAULT_START, StartConfig
 from droid_jax.simulate.replay import Drive, make_drive
 
 
-def spread(recording: Recording, config: StartConfig = DEFAULT_START) -> dict[str, float]:
+def start_ranges(recording: Recording, config: StartConfig = DEFAULT_START) -> dict[str, float]:
     """Joint -> range of the repeats' measured starts, rad or m, of joints where it exceeds scatter and noise."""
     if "position" not in recording.channels or recording.repeats < 2 or not recording.command.size:
         return {}
@@ -37,7 +37,7 @@ def own_starts(recording: Recording, config: StartConfig = DEFAULT_START) -> Rec
     Raises ValueError for an invalid recording.
     """
     validate(recording, allow_jitter=True)  # a recording made in Python was perhaps not validated yet
-    different = spread(recording, config)
+    different = start_ranges(recording, config)
     if not different.keys() & recording.qpos0.keys():
         return recording
     return replace(recording, qpos0={j: q for j, q in recording.qpos0.items() if j not in different})
@@ -66,7 +66,7 @@ def from_one_start(
         The recording with corrected values [N, Tc, C], exact to first order in the spread of the starts.  The same
         object if the repeats start at the same place, or if a replay diverges.
     """
-    if not spread(recording, config):
+    if not start_ranges(recording, config):
         return recording
     replays = [replay(_own_drive(scene, recording, n, drive, config)) for n in range(recording.repeats)]
     if not all(bool(np.all(np.asarray(r.finite))) for r in replays):
@@ -84,7 +84,7 @@ def _own_drive(scene: Scene, recording: Recording, repeat: int, drive: Drive, co
     """The drive of one repeat from its own measured start; joints that were not measured there start as in `drive`."""
     one = recording.repeats_subset([repeat])
     measured = one.measured_start()
-    unmeasured = {j: float(drive.qpos0[scene.qpos(j)]) for j in spread(recording, config) if j not in measured}
+    unmeasured = {j: float(drive.qpos0[scene.qpos(j)]) for j in start_ranges(recording, config) if j not in measured}
     return make_drive(scene, replace(one, qpos0={**one.qpos0, **unmeasured}), weigh=False, config=config)
 
 

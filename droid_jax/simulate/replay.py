@@ -36,7 +36,7 @@ from droid_jax.simulate.initial_state import (
     DEFAULT_START,
     StartConfig,
     check_weight,
-    holding,
+    holding_controls,
     start_pose,
     weight_share,
 )
@@ -109,7 +109,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     steps = round(end_on(recording, timestep) / timestep) + 1
     clock = float(recording.time[0]) + np.arange(steps) * timestep
     qpos0 = start_pose(scene, recording, config)
-    held = holding(scene, qpos0)
+    held = holding_controls(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
     command = np.tile(held, (steps, 1))
     sent = np.flatnonzero(columns >= 0)
@@ -176,7 +176,7 @@ def servo_replay(
     inputs = traced_part(scene, drive)
 
     def replay(physics: Physics) -> Rollout:
-        return sensed(motion(physics, *inputs, len(drive.command)), physics.theta, effects, drive.timestep)
+        return with_sensor_model(motion(physics, *inputs, len(drive.command)), physics.theta, effects, drive.timestep)
 
     return replay
 
@@ -279,7 +279,7 @@ def servo_motion(
     return motion
 
 
-def sensed(
+def with_sensor_model(
     motion: Rollout,
     theta: Theta,
     effects: Sequence[Effect],

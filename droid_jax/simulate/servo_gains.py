@@ -27,7 +27,7 @@ def check_gains(scene: Scene, drive: Drive) -> None:
     """Raise ValueError if a recording states another gain for an actuator that is no position servo."""
     if drive.stiffness is None:
         return
-    rows = zip(scene.command_names, drive.stiffness, own_stiffness(scene), position_servos(scene.model), strict=True)
+    rows = zip(scene.command_names, drive.stiffness, scene_stiffness(scene), position_servos(scene.model), strict=True)
     for name, stated, of_scene, servo in rows:
         if not servo and not np.isclose(stated, of_scene, rtol=EQUAL):
             raise ValueError(
@@ -42,12 +42,12 @@ def position_servos(model: mujoco.MjModel) -> np.ndarray:
     return (gain != 0) & (model.actuator_biasprm[:, 1] == -gain)
 
 
-def own_stiffness(scene: Scene) -> np.ndarray:
+def scene_stiffness(scene: Scene) -> np.ndarray:
     """[U] N m/rad or N/m, the scene's position gains at the joint."""
     return scene.model.actuator_gainprm[:, 0] * scene.model.actuator_gear[:, 0] ** 2
 
 
-def own_damping(scene: Scene) -> np.ndarray:
+def scene_damping(scene: Scene) -> np.ndarray:
     """[U] N m s/rad or N s/m, the scene's velocity gains at the joint; 0 for a servo without one."""
     return -scene.model.actuator_biasprm[:, _VELOCITY] * scene.model.actuator_gear[:, 0] ** 2
 
@@ -63,7 +63,7 @@ def servo_factors(scene: Scene, drive: Drive) -> np.ndarray:
 def _factors(scene: Scene, stiffness: np.ndarray | None, damping: np.ndarray | None) -> np.ndarray:
     """[U, 2] the same for stated gains [U]; None: none are stated."""
     servos = position_servos(scene.model)
-    pairs = ((stiffness, own_stiffness(scene)), (damping, own_damping(scene)))
+    pairs = ((stiffness, scene_stiffness(scene)), (damping, scene_damping(scene)))
     return np.stack([_ratio(stated, of_scene, servos) for stated, of_scene in pairs], axis=1)
 
 
@@ -101,7 +101,7 @@ def stated_gains(scene: Scene, recording: Recording) -> tuple[np.ndarray, np.nda
         return None
     columns = scene.command_index(recording.command_names)
     sent = np.flatnonzero(columns >= 0)
-    stiffness, damping = own_stiffness(scene), own_damping(scene)
+    stiffness, damping = scene_stiffness(scene), scene_damping(scene)
     stiffness[sent] = np.asarray(recording.gains.stiffness, dtype=float)[columns[sent]]
     if recording.gains.damping is not None:
         damping[sent] = np.asarray(recording.gains.damping, dtype=float)[columns[sent]]
@@ -128,8 +128,8 @@ def gains_note(scene: Scene, recording: Recording) -> str:
     if not recording.command.size or (stated := stated_gains(scene, recording)) is None:
         return ""
     stiffness, damping = stated
-    other = _in_place(scene, stiffness, own_stiffness(scene))
-    damped = [f"damping of {text}" for text in _in_place(scene, damping, own_damping(scene))]
+    other = _in_place(scene, stiffness, scene_stiffness(scene))
+    damped = [f"damping of {text}" for text in _in_place(scene, damping, scene_damping(scene))]
     if not other and not damped:
         return ""
     ignored = _ignored_damping(scene, damping)
@@ -151,7 +151,7 @@ def _ignored_damping(scene: Scene, stated: np.ndarray) -> list[str]:
     """Joints whose stated damping [U] differs from the joint's and whose servo has no velocity gain."""
     return [
         name
-        for name, new, of_scene in zip(scene.command_names, stated, own_damping(scene), strict=True)
+        for name, new, of_scene in zip(scene.command_names, stated, scene_damping(scene), strict=True)
         if of_scene == 0
         and new > 0
         and name in scene.driven_joints

@@ -143,7 +143,7 @@ class TooShort(ValueError):
     """A recording that is shorter than one window."""
 
 
-def cut(
+def cut_windows(
     scene: Scene,
     recording: Recording,
     drive: Drive,

@@ -14,7 +14,7 @@ from droid_jax.model.scene import Scene, compile_scene, load_scene
 from droid_jax.preflight.preflight import closed_loop
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.closed_loops import OPEN, open_loops
-from droid_jax.simulate.inverse_dynamics import prescribed
+from droid_jax.simulate.inverse_dynamics import prescribed_joints
 from droid_jax.simulate.replay import make_drive
 
 TIME = np.arange(0.0, 1.0, 0.01)
@@ -120,10 +120,10 @@ def test_a_log_without_commands_warns_of_a_loop_that_it_leaves_out():
         joints=(), command=np.zeros((0, 0)), time=np.zeros(0), channels={"torque": torque, "position": position}
     )
     with pytest.warns(UserWarning, match=r"the replay ignores <connect> 'pin' of scene 'four-bar'"):
-        assert prescribed(four_bar(), log) == ("crank",)
+        assert prescribed_joints(four_bar(), log) == ("crank",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        prescribed(four_bar('<joint joint1="rocker" joint2="coupler"/>'), log)
+        prescribed_joints(four_bar('<joint joint1="rocker" joint2="coupler"/>'), log)
 
 
 # ----- floating bases

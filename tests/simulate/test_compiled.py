@@ -24,7 +24,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate import compiled
 from droid_jax.simulate.batching import time_loop
-from droid_jax.simulate.replay import TORQUE_OFFSETS, make_drive, sensed, servo_replay
+from droid_jax.simulate.replay import TORQUE_OFFSETS, make_drive, servo_replay, with_sensor_model
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_sensors_see_the_friction_behind_them_before_they_err(scene: Scene):
     theta = {"coulomb[shoulder]": 2.0, "crosstalk_before[elbow]": 0.25, "torque_offset[shoulder]": 8.0}
     still = jnp.zeros((5, 2))
     motion = Rollout(still[:, 0], still, still, still + 1.0, still[:, 0], still[:, :0], jnp.array(True))
-    seen = sensed(motion, {n: jnp.float32(v) for n, v in theta.items()}, made_with, 0.002)
+    seen = with_sensor_model(motion, {n: jnp.float32(v) for n, v in theta.items()}, made_with, 0.002)
     np.testing.assert_allclose(seen.torque, np.tile([10.0, 0.5], (5, 1)))
 
 

@@ -27,7 +27,7 @@ from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.model.step import gear_torques
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.compiled import compiled_replay
-from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed_joints
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay, torque_offset_effect
 
@@ -240,7 +240,7 @@ def log(columns: Sequence[str], holes: bool = False) -> Recording:
 def test_a_joint_that_carries_a_measured_one_moves_with_the_log():
     """Torques are asked of the second joint alone, and the first one tips and swings it all the same."""
     whole, part = planar(), planar(joints=["b"])
-    assert prescribed(part, log(["a", "b"])) == ("b", "a")
+    assert prescribed_joints(part, log(["a", "b"])) == ("b", "a")
     given = motion(whole, LINK, True)
     turned = {name: getattr(given, name)[:, ::-1] for name in ("position", "velocity", "acceleration")}
     space = Space(torque_offsets(["b"]))
@@ -253,10 +253,10 @@ def test_a_carrier_without_positions_is_warned_of():
     part = planar(joints=["b"])
     for recording in (log(["b"]), log(["a", "b"], holes=True)):
         with pytest.warns(UserWarning, match="does not hold the positions of a throughout, which carry"):
-            assert prescribed(part, recording) == ("b",)
+            assert prescribed_joints(part, recording) == ("b",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert prescribed(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
+        assert prescribed_joints(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
 
 
 def test_a_carried_joint_with_holes_in_its_positions_is_warned_of():
@@ -270,10 +270,10 @@ def test_a_carried_joint_with_holes_in_its_positions_is_warned_of():
     mask[:, 100, 1] = False
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert prescribed(part, holed()) == ("a", "b")
+        assert prescribed_joints(part, holed()) == ("a", "b")
     mask[:, 100:120, 1] = False
     with pytest.warns(UserWarning, match=r"positions of b for a part of the time: .*--start S --end S"):
-        assert prescribed(part, holed()) == ("a",)
+        assert prescribed_joints(part, holed()) == ("a",)
 
 
 @pytest.mark.parametrize("part", ["command", "servo"])
@@ -334,7 +334,7 @@ def test_a_log_of_a_robot_that_floats_is_refused():
     with pytest.raises(
         ValueError, match=r"the joint of body .* of scene 'walks' \(a free or ball joint\) carries measured"
     ):
-        prescribed(scene, standing({}))
+        prescribed_joints(scene, standing({}))
 
 
 def test_a_part_of_a_log_keeps_what_stands_still():
@@ -356,4 +356,4 @@ def test_a_carrier_with_a_hole_in_its_positions_is_warned_of_though_its_start_is
     mask[:, 100:120, 1] = False
     holed = replace(path, columns=("arm", "torso"), values=values, mask=mask)
     with pytest.warns(UserWarning, match="the positions of torso throughout"):
-        assert prescribed(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)
+        assert prescribed_joints(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)

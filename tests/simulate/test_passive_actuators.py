@@ -14,7 +14,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.preflight import left_alone
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.simulate.initial_state import holding
+from droid_jax.simulate.initial_state import holding_controls
 from droid_jax.simulate.replay import make_drive
 from droid_jax.synthetic.robot import _control
 
@@ -106,11 +106,11 @@ def test_holding_controls_pull_nowhere():
     arm = scene()
     model, data = arm.model, mujoco.MjData(arm.model)
     qpos = arm.initial_qpos(START)
-    data.qpos[:], data.ctrl[:] = qpos, holding(arm, qpos)
+    data.qpos[:], data.ctrl[:] = qpos, holding_controls(arm, qpos)
     mujoco.mj_forward(model, data)
     assert data.actuator_force == pytest.approx(np.zeros(3), abs=1e-9)
     assert data.ctrl == pytest.approx([0.2, GRIP, 0.3])
-    far = holding(arm, arm.initial_qpos({"a": 1.0, "b": 1.0}))
+    far = holding_controls(arm, arm.initial_qpos({"a": 1.0, "b": 1.0}))
     assert far[1] == 255.0  # its range ends there
 
 
