@@ -1,4 +1,4 @@
-"""What a scene may use: what MJX leaves out is refused by name, and all that it keeps does what it does in C."""
+"""Features of a scene: those that MJX ignores are refused by name, and supported ones agree with C."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def arm(**filled: str) -> mujoco.MjSpec:
         (dict(more='<deformable/><equality><connect body1="upper" anchor="0 0 1"/></equality>'), None),
     ],
 )
-def test_what_no_replay_has_is_refused_by_name_when_a_scene_is_loaded(filled: dict, says: str | None):
+def test_unsupported_features_are_refused_at_loading(filled: dict, says: str | None):
     if says is None:
         assert compile_scene(arm(**filled), "arm").model.neq == 1
         return
@@ -76,7 +76,7 @@ def test_what_no_replay_has_is_refused_by_name_when_a_scene_is_loaded(filled: di
 
 
 @pytest.mark.parametrize("integrator", ["RK4", "implicit"])
-def test_integrators_that_no_replay_has_are_refused_when_a_scene_is_loaded(integrator: str, tmp_path: Path):
+def test_unsupported_integrators_are_refused_at_loading(integrator: str, tmp_path: Path):
     file = tmp_path / "arm.xml"
     file.write_text(ARM.format(**dict.fromkeys(SLOTS, "")).replace("implicitfast", integrator).replace("<flag />", ""))
     with pytest.raises(ValueError, match=r"arm.xml: .*integrates with Euler or implicitfast"):
@@ -86,7 +86,7 @@ def test_integrators_that_no_replay_has_are_refused_when_a_scene_is_loaded(integ
     )
 
 
-def test_cones_pass_where_the_replays_have_them():
+def test_elliptic_cones_are_allowed_where_supported():
     for engine, mj_step in (("mujoco", False), ("mjx", True)):
         scene = compile_scene(arm(option='cone="elliptic"'), "arm", engine=engine, mj_step=mj_step)
         assert scene.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -109,7 +109,7 @@ def test_a_callback_of_the_process_is_refused():
 
 
 def test_every_number_of_a_model_that_mjx_does_not_take_is_known():
-    """A version of MuJoCo with a new one fails here: is it refused, or does it change nothing?"""
+    """A new field of another MuJoCo version fails here: it must be refused, or have no effect."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     taken = {f.name for kind in (types.Model, types.ModelJAX) for f in types.Model.fields() + kind.fields()}
     here = {
@@ -209,7 +209,7 @@ QUICK = ("joints and equalities",)
 
 
 @pytest.mark.parametrize("kept", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEPT])
-def test_what_is_kept_does_in_a_step_what_it_does_in_c(kept: str):
+def test_supported_features_give_the_same_step_as_c(kept: str):
     slots = {**dict.fromkeys(("option", "floor", "world", "a", "b", "fore", "ball", "more"), ""), "thing": FREE_SPHERE}
     model = mujoco.MjModel.from_xml_string(WORLD.format(**{**slots, **KEPT[kept]}))
     refuse_ignored(model, kept)
