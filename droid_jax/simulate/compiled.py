@@ -227,8 +227,8 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
     """
     given = {e.name for e in effects}
     friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
-    felt, read = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
-    return (*(e for e in felt if e.name not in given), *effects, *(e for e in read if e.name not in given))
+    before, after = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
+    return (*(e for e in before if e.name not in given), *effects, *(e for e in after if e.name not in given))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
@@ -236,9 +236,9 @@ def _sensor_effects(
     joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool
 ) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
     """Effects before and after the others.  Cached, since programs are looked up by the identity of their effects."""
-    felt = (joint_friction_effect(joints, jnp.sign if prescribed else direction),) if friction else ()
-    read = (torque_gain_effect(joints),) if gain else ()
-    return felt, (*read, torque_offset_effect(joints))
+    before = (joint_friction_effect(joints, jnp.sign if prescribed else direction),) if friction else ()
+    after = (torque_gain_effect(joints),) if gain else ()
+    return before, (*after, torque_offset_effect(joints))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
@@ -304,16 +304,16 @@ def _inverse_in_c(
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
     bodies, sense = c_path_torques(scene, space, torque, joints), path_sensors(scene, torque, effects, joints)
 
-    def read(values: jax.Array, felt: PathTorques, path: Path) -> Rollout:
-        return sense(complete(theta_of(space, values), effects), path, felt)
+    def read(values: jax.Array, torques: PathTorques, path: Path) -> Rollout:
+        return sense(complete(theta_of(space, values), effects), path, torques)
 
     each = jax.jit(
         jax.vmap(_of_bodies(scene, space, read), in_axes=(0, 0, None)), compiler_options=runtime.compiler_options()
     )
 
     def batch(values: np.ndarray, path: Path) -> Rollout:
-        felt = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
-        return each(jnp.asarray(values, jnp.float32), felt, path)
+        in_c = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
+        return each(jnp.asarray(values, jnp.float32), in_c, path)
 
     def torques(values: jax.Array, paths: Path) -> jax.Array:
         row = np.asarray(values)[None]

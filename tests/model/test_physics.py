@@ -338,9 +338,9 @@ def test_a_geom_that_was_moved_or_enlarged_touches_in_both_engines(field: str, c
     xml = """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .3"><joint name="z" type="slide"
       damping="30" axis="0 0 1"/><geom name="ball" size=".05" mass="1"/></body></worldbody>
       <actuator><motor joint="z"/></actuator></mujoco>"""
-    twin, mjx_, compiled_ = rests(xml, field, column, value)
+    in_c, mjx_, compiled_ = rests(xml, field, column, value)
     assert compiled_ > -0.2  # 0.05 would lie at -0.25
-    np.testing.assert_allclose([twin, mjx_], compiled_, atol=1e-3)
+    np.testing.assert_allclose([in_c, mjx_], compiled_, atol=1e-3)
 
 
 def test_a_moved_joint_axis_is_derived_too():

@@ -19,7 +19,7 @@ from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate import c_reference as twin
+from droid_jax.simulate import c_reference
 from droid_jax.simulate.batching import over_population
 from droid_jax.simulate.c_engine import Trace, instrument, simulate
 from droid_jax.simulate.c_reference import c_replay
@@ -128,7 +128,7 @@ def test_half_a_step_of_delay_halves_the_error_of_the_c_engine(
     scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout, fine: Trace, monkeypatch
 ):
     """Before the grasp its error decreases by more than half; afterwards the contact's error is larger."""
-    monkeypatch.setattr(twin, "control_of", lambda drive, command, offset, late: command)
+    monkeypatch.setattr(c_reference, "control_of", lambda drive, command, offset, late: command)
     plain = c_replay(scene, space, drive)(rows[:1])
     free = slice(0, 700)
     with_delay = rms(in_c.torque[:1, free], fine.torque[:1, free])

@@ -185,25 +185,25 @@ def test_the_c_replay_is_mj_step(scene: Scene, drive: Drive):
     position, velocity, torque = c_rollout(scene, drive, delay=0.001)
     np.testing.assert_allclose(got.torque[0], torque, atol=1e-12)
     np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=1e-12)
-    told = velocity[:-1] + 0.5 * np.diff(velocity, axis=0)
-    np.testing.assert_allclose(got.velocity[0, :-1], told, atol=1e-12)
+    reported = velocity[:-1] + 0.5 * np.diff(velocity, axis=0)
+    np.testing.assert_allclose(got.velocity[0, :-1], reported, atol=1e-12)
 
 
 @pytest.mark.slow  # quick with effects: tests/model/effects/test_parity.py
 def test_the_c_replay_equals_the_parity_replay(scene: Scene, drive: Drive):
-    twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
+    in_c, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
     for channel in ("torque", "position", "velocity"):
-        np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
+        np.testing.assert_allclose(getattr(in_c, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
 
 
 @pytest.mark.slow
 def test_without_delay_both_equal_what_mj_step_logs(scene: Scene, drive: Drive):
     logged = c_rollout(scene, drive, delay=0.0)
-    twin = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
+    in_c = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
     mjx = replayed(parity=True, late=0.0)
-    for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
-        told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
-        for got, expected, within in zip(told, logged, atol, strict=True):
+    for rollout, atol in ((in_c, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
+        reported = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
+        for got, expected, within in zip(reported, logged, atol, strict=True):
             np.testing.assert_allclose(got, expected, atol=within)
 
 

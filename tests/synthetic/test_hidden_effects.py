@@ -153,7 +153,7 @@ def test_a_typical_amplitude_changes_a_valid_recording(
     effect = HIDDEN[name]
     assert 0 < effect.typical[0] < effect.typical[1]
     recording = validate(hidden(scene, demonstration, Applied(name, effect.typical[1])))
-    assert recording.meta == plain.meta  # nothing tells what was hidden
+    assert recording.meta == plain.meta  # without what was hidden
     torque, none = recording.channel("torque").values, plain.channel("torque").values
     assert np.isfinite(torque).all()
     assert 1e-3 < np.abs(torque - none).max() < 40.0
@@ -435,7 +435,7 @@ def test_link_side_torques_exclude_the_gears(scene: Scene, demonstration: Record
     """
     effects = [Applied(name, 1.0)] if name else []
     smooth = copy.copy(scene.model)
-    smooth.dof_frictionloss[:] = 0  # which no sensor of C MuJoCo tells
+    smooth.dof_frictionloss[:] = 0  # no sensor of C MuJoCo measures it
     scene = replace(scene, model=smooth)
     quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
     recording = hidden(scene, demonstration, *effects, side=TorqueSide.LINK, rate=4000.0, **quiet)

@@ -17,7 +17,7 @@ from droid_jax.model.parameters import Space
 
 NOISE = 0.003  # N m: a sensor's 0.01, the mean of ten repeats
 FAR = 5.0  # posterior deviations: 52 parameters stay inside unless something is wrong
-KNOWN = 0.15  # of a value: a posterior no wider says that the recording tells it
+KNOWN = 0.15  # relative width of a posterior up to which a parameter counts as identifiable
 LEFT_OVER = 1.05  # mean square of the residuals in units of the noise, which is 1 but for its own scatter of 0.01
 
 
