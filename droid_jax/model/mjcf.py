@@ -126,7 +126,7 @@ def fitted_files(
     try:
         if scene.path is None:
             raise NotInPlace("the scene was put together in memory")
-        edited = edit(scene.path, fitted.before, fitted.wanted, fitted.weighed, main)
+        edited = edit(scene.path, fitted.before, fitted.wanted, fitted.new_inertia, main)
         _check_files(edited.files, main, fitted.written)
     except (ValueError, OSError) as error:
         reason = " ".join(str(error).split())
@@ -145,7 +145,7 @@ class _Fitted:
         written: the model compiled from `spec`.
         model: the scene's model with the values.
         wanted: numbers that differ.
-        weighed: body with another inertia -> `model`.
+        new_inertia: body with another inertia -> `model`.
     """
 
     scene: Scene
@@ -154,7 +154,7 @@ class _Fitted:
     written: mujoco.MjModel
     model: mujoco.MjModel
     wanted: tuple[WantedNumber, ...]
-    weighed: dict[int, mujoco.MjModel]
+    new_inertia: dict[int, mujoco.MjModel]
 
 
 def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect]) -> _Fitted:
@@ -191,9 +191,9 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
     old = _elements(before, model)
     wanted = tuple(_wanted(scene.model, model, kind, old[kind][row], e, row, f) for kind, e, row, f in changed)
     differs = np.any([_differ(getattr(scene.model, f), getattr(model, f)) for f in sorted(_WEIGHT)], axis=0)
-    weighed = {int(b): model for b in np.flatnonzero(differs & (model.body_mass > 0))}
+    new_inertia = {int(b): model for b in np.flatnonzero(differs & (model.body_mass > 0))}
     unique = {(w.element, w.row, w.field): w for w in wanted}
-    return _Fitted(scene, spec, before, written, model, tuple(unique.values()), weighed)
+    return _Fitted(scene, spec, before, written, model, tuple(unique.values()), new_inertia)
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -235,7 +235,7 @@ def _changes(fitted: _Fitted, edited: Edited | None) -> Iterator[Change]:
             where = placed.file, placed.line, placed.origin
             index = 0 if short else int(k)
             yield Change(want.element, named, placed.attribute, index, want.field, entry, *numbers, *where)
-    for body in fitted.weighed:
+    for body in fitted.new_inertia:
         where = ("", 0) if edited is None else edited.bodies[body]
         for field in sorted(_WEIGHT):
             old, new = (np.atleast_1d(getattr(m, field)[body]) for m in (nominal, model))

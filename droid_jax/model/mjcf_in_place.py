@@ -104,7 +104,11 @@ class Edited:
 
 
 def edit(
-    path: Path, spec: mujoco.MjSpec, wanted: Sequence[WantedNumber], weighed: Mapping[int, mujoco.MjModel], main: str
+    path: Path,
+    spec: mujoco.MjSpec,
+    wanted: Sequence[WantedNumber],
+    new_inertia: Mapping[int, mujoco.MjModel],
+    main: str,
 ) -> Edited:
     """The user's files with numbers replaced.
 
@@ -112,7 +116,7 @@ def edit(
         path: of the main file.
         spec: of that file, compiled so that its elements are numbered.
         wanted: the numbers.
-        weighed: body -> model with its new mass, centre of mass and inertia.
+        new_inertia: body -> model with its new mass, centre of mass and inertia.
         main: name of the main file in the result; changed included files go to a folder "STEM_parts" beside it.
 
     Returns:
@@ -125,20 +129,20 @@ def edit(
     tree = read_tree(path)
     if tree.root.name != "mujoco":
         raise NotInPlace(f"{path.name} is a <{tree.root.name}>, not an MJCF")
-    places = _elements(tree, spec)
+    tags = _elements(tree, spec)
     edits: dict[Tag, dict[str, str | None]] = {}
     inserted: dict[Tag, str] = {}
     placed: list[PlacedNumber] = []
     for want in wanted:
-        tag = places[want.element][want.row]
+        tag = tags[want.element][want.row]
         attributes = _attribute(tag, want)
         name = next((k for k, v in attributes.items() if v is not None), "")
         origin = "" if not name or name in tag.attributes else _origin(tree, tag, name)
         placed.append(PlacedNumber(name, tag.file.name, tag.line, origin))
         edits.setdefault(tag, {}).update(attributes)
-    for body, model in weighed.items():
-        _weigh(places["body"][body], body, model, edits, inserted)
-    bodies = {body: (places["body"][body].file.name, places["body"][body].line) for body in weighed}
+    for body, model in new_inertia.items():
+        _write_inertia(tags["body"][body], body, model, edits, inserted)
+    bodies = {body: (tags["body"][body].file.name, tags["body"][body].line) for body in new_inertia}
     changed = with_edits(tree, edits, inserted)
     names = _names(tree, main)
     paths = _absolute(tree, spec, changed, names)
@@ -280,7 +284,7 @@ def _token(number: float, old: str | None) -> str:
     return f"{number:.8g}"
 
 
-def _weigh(
+def _write_inertia(
     tag: Tag, body: int, model: mujoco.MjModel, edits: dict[Tag, dict[str, str | None]], inserted: dict[Tag, str]
 ) -> None:
     """Add the edits that state a body's mass, centre of mass and inertia of a model."""

@@ -35,9 +35,9 @@ import mujoco.mjx._src.constraint as _constraint
 import mujoco.mjx._src.math as _math
 
 # Module and name of a function of mjx, looked up at each call, so that it can be replaced.
-Place = tuple[ModuleType, str]
-SEGMENT_POINT: Place = (_math, "closest_segment_point")  # a, b, p [3] m -> the point of the segment a-b closest to p
-CONSTRAINT_LAW: Place = (_constraint, "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
+Replaced = tuple[ModuleType, str]
+SEGMENT_POINT: Replaced = (_math, "closest_segment_point")  # a, b, p [3] m -> the point of the segment a-b closest to p
+CONSTRAINT_LAW: Replaced = (_constraint, "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
 
 
 class ConstraintRows(NamedTuple):
@@ -158,12 +158,12 @@ def midpoint_law(original: Callable) -> Callable:
     return law
 
 
-def _switched(place: Place, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
+def _switched(target: Replaced, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
     """Replace a function of mjx by one that a switch changes; returns the switch, off at first.
 
     new: original -> the function while the switch is on.
     """
-    module, name = place
+    module, name = target
     original = getattr(module, name)
     if (existing := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
         return existing
