@@ -1,4 +1,4 @@
-"""Encoder zero offsets.
+"""Encoder zero offsets in a replay, and the gravity compensation that they misplace.
 
 A joint whose position exceeds its encoder's reading by an offset is modelled by a reference `qpos0` that is lower by
 that offset.  Positions in the replay are then encoder readings: of servos, of a prescribed path, of the start and of

@@ -1,4 +1,4 @@
-"""Encoder zero offsets."""
+"""Encoder zero offsets of the arm's joints."""
 
 import mujoco
 import numpy as np
