@@ -240,7 +240,7 @@ def test_torques_that_hold_no_weight_are_left_out_of_an_evaluation(logs: SimpleN
     light = replace(both, torque=replace(both.torque, gravity=False))
     of = {"before": space.mean, "after": space.mean, "engine": "mujoco"}
     (whole,) = evaluate_on(scene, space, both, **of)
-    with pytest.warns(UserWarning, match="torques are left out of the errors: .* holds no weight"):
+    with pytest.warns(UserWarning, match="torques are left out of the errors: .* excludes gravity"):
         (found,) = evaluate_on(scene, space, light, **of)
     assert set(whole.errors) == {"torque", "position"} and set(found.errors) == {"position"}
     assert found.errors["position"] == whole.errors["position"] and found.recording.sha256 == light.sha256
