@@ -203,7 +203,10 @@ def test_each_equals_separate_entries(tmp_path: Path):
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ({"field": "dof_damping"}, 'elbow_damping is 1 in the model and wrist_damping is 2: state the mean .*"scale"'),
+        (
+            {"field": "dof_damping"},
+            'elbow_damping is 1 in the model and wrist_damping is 2: state a common mean.*"scale"',
+        ),
         ({"sensor": "coulomb"}, "a sensor's term belongs to one joint"),
         ({"field": "dof_damping", "element": []}, "element: the list is empty"),
         ({"field": "dof_damping", "element": ["elbow", "knee"]}, "unknown joint 'knee'"),

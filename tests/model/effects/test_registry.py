@@ -97,7 +97,7 @@ def test_other_locations_of_an_extended_model_are_neutral():
     ("effect", "said"),
     [
         (grease_at("door", name="thick grease", high=2.0), "'grease' makes is called 'thick grease'"),
-        (grease_at("door"), r"its shape 'thickness' lie outside its bounds \[0.1, 5\]: 9"),
+        (grease_at("door"), r"its shape parameter 'thickness' lie outside its bounds \[0.1, 5\]: 9"),
     ],
 )
 @pytest.mark.usefixtures("own_list")
