@@ -279,7 +279,7 @@ def test_a_parameter_with_an_effects_name_is_told_before_the_fit(called, tmp_pat
     file.write_text(json.dumps([{**entries[0], "name": "joint_coulomb[elbow]"}, *entries[1:]]))
     save_recording(elbow_log(0.0, 2.0, 16), "log.npz")
     assert main(["all", "--stages", "identify", "gap", "--recording", "log.npz", *own]) == 2
-    assert "'joint_coulomb[elbow]' (of the effect joint_coulomb); give yours others" in capsys.readouterr().err
+    assert "'joint_coulomb[elbow]' (of the effect joint_coulomb); rename them" in capsys.readouterr().err
     assert called == []
     assert main(["all", "--stages", "identify", "--recording", "log.npz", *own]) == 0
 

@@ -272,7 +272,7 @@ def test_a_log_without_commands_has_no_servo_to_suspect():
             lambda: Parameter("gasket", "N m", 0.0, 0.5, 0.0, 5.0, scaling=Scaling.LOG, log_offset=0.05),
             "'gasket' must be scaled linearly",
         ),
-        (lambda: Parameter("seal", "N m", 0.0, 0.5, 0.0, 5.0), "speaks of a parameter 'gasket' that it does not have"),
+        (lambda: Parameter("seal", "N m", 0.0, 0.5, 0.0, 5.0), "names a parameter 'gasket' that it does not have"),
     ],
 )
 def test_an_effect_that_cannot_be_neutral(

@@ -249,9 +249,8 @@ def identify_config(command: Identify) -> IdentifyConfig:
     from droid_jax.identify.pipeline import IdentifyConfig
 
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
-    fewer = {"samples": 64} if command.preset == "quick" else {}
     return IdentifyConfig(
-        **fewer,
+        samples=64 if command.preset == "quick" else IdentifyConfig().samples,
         engine=command.engine,
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),

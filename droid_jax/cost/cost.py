@@ -32,8 +32,8 @@ from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import Along, Driven, along_another, compiled_replay
 from droid_jax.simulate.engine import ENGINES
-from droid_jax.simulate.initial_state import StartConfig, following
-from droid_jax.simulate.inverse_dynamics import motion_path, prescribed
+from droid_jax.simulate.initial_state import StartConfig, coupled_addresses
+from droid_jax.simulate.inverse_dynamics import motion_path, prescribed_joints
 from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
 from droid_jax.simulate.replay import Drive, make_drive
@@ -328,7 +328,7 @@ def followed(scene: Scene, recording: Recording, config: CompareConfig) -> Drive
         raise ValueError(f"no joint of scene {scene.name!r} is driven: name the measured ones (--joints)")
     relevant = (*scene.joints, *scene.carriers(scene.joints))  # joints whose motion enters the compared torques
     cutoff = config.motion_cutoff
-    joints = prescribed(scene, recording, cutoff)
+    joints = prescribed_joints(scene, recording, cutoff)
     return measured_motion(recording, joints, cutoff=cutoff, alike=relevant, rest=config.rest)
 
 
@@ -406,8 +406,8 @@ def _same_start(scene: Scene, new: Drive | Motion, old: Drive | Motion, config: 
         hinge = scene.qpos(scene.object_joint)
         if scene.model.qpos0[hinge] in (new.qpos0[hinge], old.qpos0[hinge]):
             tolerance[hinge] += config.ajar
-    # Positions that follow from others differ as much as those do.
-    tolerance[list(following(scene, new.qpos0) & following(scene, old.qpos0))] = np.inf
+    coupled = coupled_addresses(scene, new.qpos0) & coupled_addresses(scene, old.qpos0)
+    tolerance[list(coupled)] = np.inf  # an equality moves them with the joints that couple them
     return bool(np.all(np.abs(new.qpos0 - old.qpos0) <= tolerance))
 
 

@@ -24,7 +24,7 @@ from droid_jax.simulate.batching import block_size
 from droid_jax.simulate.compiled import window_program
 from droid_jax.simulate.replay import Drive, end_on
 from droid_jax.simulate.servo_gains import servo_factors
-from droid_jax.simulate.windows import WindowConfig, Windows, cut, start_spread
+from droid_jax.simulate.windows import WindowConfig, Windows, cut_windows, start_spread
 
 STRETCH_SECONDS = 0.5  # length of the stretches of a full motion, which are units of the tests as windows are
 # Motions of different lengths share one compiled program of the longest one.  A motion may be replayed for at most so
@@ -248,7 +248,7 @@ def in_windows(
     """
     if any(effect.profile is not None for effect in effects):
         windows = replace(windows, history=max(windows.history, windows.past))
-    every = cut(scene, recording, drive, repeat, windows, grid, number)
+    every = cut_windows(scene, recording, drive, repeat, windows, grid, number)
     if not len(every.begin):
         return None
     instants = (np.arange(max(1, round(windows.length * config.noise.rate))) + 0.5) / config.noise.rate
@@ -263,7 +263,7 @@ def in_windows(
     stated = functools.partial(space.with_known, drive.known)
     stated(space.mean)  # raises here for wrong stated values, not at the first replay
     return Piece(
-        _name(recording, repeat), every.kept(complete), program, kernels, {}, columns, *of_windows, stated=stated
+        _name(recording, repeat), every.subset(complete), program, kernels, {}, columns, *of_windows, stated=stated
     )
 
 

@@ -27,7 +27,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Phase, Recording
 from droid_jax.simulate.replay import Drive
-from droid_jax.simulate.windows import TooShort, WindowConfig, why_whole
+from droid_jax.simulate.windows import TooShort, WindowConfig, why_no_windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +255,7 @@ def windowed_log(
         effects: in the replays.
         fitted_share: share of each repeat's windows that come before the test data.
         grid: s, time step that windows begin on; None for the scene's.
-        whole: replay full motions, also where `why_whole` gives no reason to.
+        whole: replay full motions, also where `why_no_windows` gives no reason to.
 
     Raises:
         ValueError: what `make_cost` refuses, `mj_step`, recordings that are all shorter than a window, or no window
@@ -272,7 +272,7 @@ def windowed_log(
     check_read(scene, space, effects)
     check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
-    reasons = [why_whole(scene, recording) for recording in recordings]
+    reasons = [why_no_windows(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")
     drives = list[Drive]()
     for recording in recordings:

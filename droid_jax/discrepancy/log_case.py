@@ -42,7 +42,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
-from droid_jax.simulate.windows import held, why_whole
+from droid_jax.simulate.windows import fully_servoed, why_no_windows
 
 Log: TypeAlias = LoneLog | WindowedLog
 Report: TypeAlias = Callable[[RefineProgress], None] | None
@@ -343,7 +343,7 @@ def windowed_case(
     config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
     base = restrained(base, config.selection.nuisance_bound, {n for r in (*train, *test) for n in r.known})
     share = 1.0 if test else config.blocks.fitted_share
-    at_once = config.replay == "whole" or (config.replay == "auto" and held(scene))
+    at_once = config.replay == "whole" or (config.replay == "auto" and fully_servoed(scene))
     compare, windows, judging = config.compare, config.windows, config.windows
     if sampled := config.replay == "auto" and at_once and _seconds(train) > windows.longest:
         at_once, judging = False, windows.sampled(_seconds(test))
@@ -352,7 +352,7 @@ def windowed_case(
             config, **{name: replace(getattr(config, name), **FEWER_TRIALS) for name in ("refine", "refit", "polish")}
         )
     unknown = list[str]()
-    if not at_once and not any(why_whole(scene, recording) for recording in train):
+    if not at_once and not any(why_no_windows(scene, recording) for recording in train):
         unknown = [e.name for e in effects if e.over_time]
         effects = [e for e in effects if not e.over_time]
     left_out = (

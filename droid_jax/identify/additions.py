@@ -29,7 +29,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.preflight import torque_range
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
-from droid_jax.simulate.servo_gains import own_stiffness, with_stated_gains
+from droid_jax.simulate.servo_gains import scene_stiffness, with_stated_gains
 
 CHANNELS = ("torque", "position", "velocity")  # that the recording of an addition has
 DEFAULT_PROPOSAL = ProposalConfig()
@@ -335,7 +335,7 @@ def _largest_step(scene: Scene, recording: Recording, joint: str, share: float) 
     if joint not in scene.single_joints or joint not in scene.command_names:
         return np.inf
     u, limit = scene.command_names.index(joint), min(np.abs(torque_range(scene, joint)))
-    stiffness = own_stiffness(replace(scene, model=with_stated_gains(scene, recording)))[u]
+    stiffness = scene_stiffness(replace(scene, model=with_stated_gains(scene, recording)))[u]
     return share * limit / stiffness if stiffness > 0 else np.inf
 
 

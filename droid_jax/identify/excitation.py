@@ -224,7 +224,7 @@ def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> s
     for recording in recordings:
         if recording.command.size and (contacts or why_not_in_c(scene, space, recording.torque, ())):
             return "mjx"
-        if not recording.command.size and why_no_path_in_c(scene, space, recording.torque, ()):
+        if not recording.command.size and why_no_path_in_c(space, recording.torque, ()):
             return "mjx"
     return "mujoco"
 

@@ -1,14 +1,14 @@
-"""The DC motor of a servo as parameters: torque constant and resistance, or stall torque and no-load speed.
+"""Parameters of a servo's DC motor: torque constant and resistance, or stall torque and no-load speed.
 
-A servo's electronics put a share d of the supply's voltage V onto a motor of torque constant K and resistance R, by a
-firmware gain g of the position error, as far as there is voltage:
+A servo's electronics apply a duty d of the supply voltage V to a motor with torque constant K and resistance R.  The
+firmware has a gain g of the position error:
 
     d = clip(g (u - q), -1, 1)        torque = K V / R d - K^2 / R w
 
-In an MJCF that is <position kp="g K V/R" forcerange="-K V/R K V/R"/> on a joint with damping K^2/R, its back
-electromotive force.  With the stall torque T = K V / R and the no-load speed W = V / K the damping is T / W.
-Each term below is a factor on what the MJCF has, 1 at nominal; viscous friction counts as damping too.
-Recordings may state the gain that the firmware had in each (`simulate.servo_gains`).
+In an MJCF that is <position kp="g K V/R" forcerange="-K V/R K V/R"/> on a joint with damping K^2/R (back electromotive
+force).  With the stall torque T = K V / R and the no-load speed W = V / K the damping is T / W.  Each term below is a
+factor on the MJCF's numbers, 1 at nominal.  It also scales viscous friction, which is part of the damping.  Recordings
+may state the gain of the firmware (`simulate.servo_gains`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from droid_jax.model.parameters import Mode, Parameter, Scaling, Write
 from droid_jax.model.scene import Scene
 
 STALL, NO_LOAD, CONSTANT, RESISTANCE = "stall_torque", "no_load_speed", "torque_constant", "resistance"
-# term -> how torques per duty (gains and limit) change, and how the back electromotive force does, one after the other
+# term -> modes of its writes to the torques per duty (gains and limit), and of those to the back electromotive force
 MOTOR_TERMS = {
     STALL: ((Mode.SCALE,), (Mode.SCALE,)),
     NO_LOAD: ((), (Mode.DIVIDE,)),
@@ -32,17 +32,20 @@ MOTOR_TERMS = {
 
 
 def motor_parameter(scene: Scene, term: str, joint: str, *, std: float = 0.2, **options: Any) -> Parameter:
-    """A factor on a number of the motor that drives a joint, 1 at nominal.
+    """A factor on a property of the motor that drives a joint, 1 at nominal.
 
     Args:
         scene: with an actuator of the joint.
         term: a key of `MOTOR_TERMS`.
-        joint: by name.
+        joint: name of the joint.
         std: prior deviation.
         options: further fields of `Parameter`; bounds are 0.2 and 5 unless given.
 
+    Returns:
+        The parameter.
+
     Raises:
-        ValueError: an unknown term, a joint without an actuator, or a term that changes nothing of this one.
+        ValueError: the term is unknown or has no effect on this joint, or the joint has no actuator.
     """
     if term not in MOTOR_TERMS:
         raise ValueError(f"unknown motor term {term!r}; valid: {', '.join(MOTOR_TERMS)}")
@@ -55,8 +58,8 @@ def motor_parameter(scene: Scene, term: str, joint: str, *, std: float = 0.2, **
     writes += [write(scene, "dof_damping", (dof,), mode) for mode in back if damped]
     if not writes:
         raise ValueError(
-            f"joint {joint!r} has no damping, which its motor's {term} would change; give it some in the MJCF: the "
-            "stall torque over the no-load speed"
+            f"joint {joint!r} has no damping, which its motor's {term} would change; set it in the MJCF to the stall "
+            "torque over the no-load speed"
         )
     return _factor(f"{joint}_{term}", std, tuple(writes), options)
 
@@ -67,7 +70,7 @@ def _factor(name: str, std: float, writes: tuple[Write, ...], options: dict[str,
 
 
 def _per_duty(scene: Scene, joint: str) -> list[tuple[str, tuple[int, ...]]]:
-    """Entries of the model that are torques in proportion to the duty: gains and, where it acts, the limit."""
+    """(field, index) of the model's entries that are proportional to torque per duty: gains and an active limit."""
     model, u = scene.model, scene.command_names.index(joint)
     entries = [("actuator_gainprm", (u, 0))]
     entries += [("actuator_biasprm", (u, k)) for k in (1, 2) if model.actuator_biasprm[u, k] != 0]

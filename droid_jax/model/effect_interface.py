@@ -1,7 +1,7 @@
-"""Where effects enter a replay: the protocol every effect follows.
+"""The interface of effects: what a replay gives to them and what they return.
 
-An effect is a named set of parameters in theta and pure functions.  A replay is
-specialised on its effects when it is traced: one that asks for none pays for none.
+An effect is a named set of parameters and pure functions.  A replay is specialised on its effects when it is traced.
+Effects that it does not have cost no time.
 """
 
 from __future__ import annotations
@@ -22,16 +22,18 @@ Theta = Mapping[str, jax.Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:
-    """What a force may depend on, before a step.
+    """The state on which a law may depend, before a step.
 
-    time: s, 0 at the first step of a servo replay; along a prescribed motion the recording's own clock.
-    qpos: [nq].  qvel: [nv].
-    load: [nv] N m, in a servo replay the actuators' torque in the step before, along a prescribed motion the torque
-    of the same instant, without effects.
-    model: the sample's mjx.Model, with the values of its parameters (fitted servo gains, say).
-    gear: [2, nv] N m, of the same moment as load: what motors give to the gears (actuators and gravity compensation),
-    and what the links put onto them (`step.gear_torques`); None where no effect changes dry friction.
-    pose: mjx.Data with the kinematics of qpos, for forces; None where nobody has worked them out.
+    Attributes:
+        time: s, 0 at the first step of a servo replay; on the recording's clock along a prescribed motion.
+        qpos: [nq] rad and m.
+        qvel: [nv] rad/s and m/s.
+        load: [nv] N m, in a servo replay the actuators' torque in the previous step; along a prescribed motion the
+            torque at the same instant, without effects.
+        model: the sample's mjx.Model, with the values of its parameters (such as servo gains).
+        pose: mjx.Data with the kinematics of qpos; None if they are not computed.
+        gear: [2, nv] N m, at the time of `load`: torque of the motors on the gears (actuators and gravity compensation)
+            and torque of the links on them (`step.gear_torques`); None if no effect changes dry friction.
     """
 
     time: jax.Array
@@ -46,16 +48,17 @@ class State:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Rollout:
-    """What a replay returns, for one sample (leading [P] when batched).
+    """The result of a replay, for one sample (leading [P] when batched).
 
-    time:     [T] s, of the states the rest was computed from: from 0 in a servo replay, on the recording's clock along
-              a measured motion.  `cost.comparisons[i].clock` is the recording's clock in both.
-    torque:   [T, J] N m (N for slides), in the recording's convention.
-    position: [T, J] rad or m.
-    velocity: [T, J] rad/s or m/s.
-    object_angle: [T] rad or m, zeros where the scene has no object.
-    contact:  [T, F] bool, True where finger f touches.
-    finite:   [] bool, False where a number of the above became NaN or infinite.
+    Attributes:
+        time: [T] s, of the states; from 0 in a servo replay, on the recording's clock along a measured motion.
+            `cost.comparisons[i].clock` is the recording's clock in both cases.
+        torque: [T, J] N m (N for slides), in the recording's convention.
+        position: [T, J] rad or m.
+        velocity: [T, J] rad/s or m/s.
+        object_angle: [T] rad or m; zeros if the scene has no object.
+        contact: [T, F] bool, True if finger f touches.
+        finite: [] bool, False if a number of the above is NaN or infinite.
     """
 
     time: Any
@@ -69,36 +72,37 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """One physical effect outside the MuJoCo model, or a change of it, that vanishes at neutral.
+    """A physical effect beside the MuJoCo model, or a change of the model, that vanishes at neutral.
 
-    name:         "hinge_preload", that of the function that makes it.
-    parameters:   what it reads from theta or writes into the model; their means are its neutral values,
-                  at which a replay is as without it.
-    profile:      (theta, command [T, U], s between its rows) -> [T, U], what a servo makes of the whole command, before
-                  any law of `command`.
-    profile_limits: "acceleration" or "speed" where `profile` limits that of a joint's goal to one over its coefficient,
-                  so that programs without this one can; empty for another path.
-    command:      (theta, time [], look) -> [U]; look(t) gives the command at time t [s].
-    servo:        (theta, State, ctrl [U]) -> [U], what the servo is given in place of the command.
-    force:        (theta, State) -> [nv] generalised force added to qfrc_applied.
-    frictionloss: (theta, State, base [nv]) -> [nv] N m, rewritten every step.
-    observe:      (theta, Rollout) -> Rollout, what the sensor makes of the truth.
-    native:       (values by name, MjModel with the fitted values) -> (field, row) -> what to add there: the same law
-                  in MuJoCo's own numbers, for the MJCF; None where this model has none.
+    Attributes:
+        name: such as "hinge_preload", the name of the function that makes it.
+        parameters: read from theta or written into the model.  Their means are the neutral values, at which a replay
+            equals one without the effect.
+        profile: (theta, command [T, U], s between its rows) -> [T, U], changes the whole command in the servo, before
+            the laws of `command`.
+        profile_limits: "acceleration" or "speed" if `profile` limits that of a joint's goal to one over the
+            coefficient, which other programs can do too; empty for another profile.
+        command: (theta, time [], command_at) -> [U]; command_at(t) is the command at time t [s].
+        servo: (theta, State, ctrl [U]) -> [U], the servo's input in place of the command.
+        force: (theta, State) -> [nv] generalised force, added to qfrc_applied.
+        frictionloss: (theta, State, base [nv]) -> [nv] N m, friction loss of the step.
+        observe: (theta, Rollout) -> Rollout, the sensor model.
+        native: (values by name, MjModel with the fitted values) -> {(field, row): increment}, the same law as numbers
+            of a MuJoCo model; None if this model cannot express it.
 
     For the search for missing effects:
-    description, signature:   a sentence each: what it is, and where it should show.
-    confused_with: names of effects that look alike on some data.
-    remedy: what to do, where the simulator is at fault and nothing on the robot.
-    special_cases:        names of effects that are special cases of it, or nearly so over the range of a motion:
-                  where one of them is equivalent, this one is dominated.
-    locations:       place -> the coefficients there, e.g. {"joint3": ("joint_coulomb[joint3]",)}; without
-                  them the effect is of no interest to the search.  A place may hold other places ("all joints").
-    shape_parameters:       parameters that matter only beside a coefficient, and the values to try.
-    minimum_size:     coefficient below which it is not named, in its own unit.
-    natural_bounds:         coefficients whose bounds are where nature ends (friction that is wholly firm): a fit may
-    stand there.
-    over_time: its law goes by the time since the recording began, of which a window out of it knows nothing.
+        description: what it is, a sentence.
+        signature: where it shows in recordings, a sentence.
+        confused_with: names of effects that are indistinguishable in some motions.
+        remedy: what to do if the simulator, not the robot, is the cause.
+        special_cases: names of effects that are special cases of it, or nearly so over the range of a motion.  If one
+            of them is equivalent, this effect is dominated.
+        locations: location -> the coefficients there, such as {"joint3": ("joint_coulomb[joint3]",)}.  The search does
+            not consider an effect without locations.  A location may contain others ("all joints").
+        shape_parameters: parameters that act only with a non-zero coefficient -> values from which fits start.
+        minimum_size: minimum effect size of a coefficient, in its unit.
+        natural_bounds: coefficients with physical bounds (such as a share of one), at which a fit may end.
+        over_time: whether its law depends on the time since the recording began, which a window does not know.
     """
 
     name: str
@@ -124,14 +128,14 @@ class Effect:
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:
-    """theta with the neutral values of what the effects read and it does not hold.
+    """theta, with neutral values for parameters of the effects that it lacks.
 
-    A model in which an effect was named at one joint has no parameters of the others.
+    A model with an effect at one joint has no parameters of that effect at other joints.
     """
     neutral = {p.name: jnp.float32(p.mean) for e in effects for p in e.parameters if not p.writes}
     return {**neutral, **theta}
 
 
 def column(theta: Theta, name: str, joints: Sequence[str]) -> jax.Array:
-    """[J] the entries `name[joint]` of theta, in their own unit; zero where theta has none."""
+    """[J] the entries `name[joint]` of theta, in the parameter's unit; zero if theta lacks them."""
     return jnp.stack([jnp.asarray(theta.get(f"{name}[{j}]", 0.0), jnp.float32) for j in joints])

@@ -1,8 +1,9 @@
-"""Encoders whose zero is not the model's.
+"""Encoder zero offsets in a replay, and the gravity compensation that they misplace.
 
-A joint that stands further than its encoder says is a joint whose reference, `qpos0`, is lower by as much: servos, a
-prescribed path, the start and what is recorded go by the encoder, and the physics by where the joint is.  What is left
-is the gravity compensation, which MuJoCo works out where the joint is, and a controller where its encoder has it.
+A joint whose position exceeds its encoder's reading by an offset is modelled by a reference `qpos0` that is lower by
+that offset.  Positions in the replay are then encoder readings: of servos, of a prescribed path, of the start and of
+recordings.  The physics uses the true positions.  Gravity compensation is the exception: MuJoCo computes it at the true
+positions, a controller at the encoders' readings.  This module computes the difference.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from droid_jax.model.scene import Scene
 
 
 def encoder_error(scene: Scene, model: Any) -> jax.Array | None:
-    """[nv] rad or m by which joints stand further than their encoders say; None where no parameter writes it.
+    """[nv] joint position minus encoder reading, rad or m; None if no parameter writes it.
 
-    model: the sample's mjx.Model.  Of hinges and slides; zero elsewhere.
+    model: the sample's mjx.Model.  The entries of free and ball joints are zero.
     """
-    own, given = scene.mjx.qpos0, model.qpos0
-    traced = any(isinstance(reference, Tracer) for reference in (own, given))
-    if given is own or (not traced and np.array_equal(own, given)):  # an equal one: of a model that a program returned
+    reference, given = scene.mjx.qpos0, model.qpos0
+    traced = any(isinstance(qpos0, Tracer) for qpos0 in (reference, given))
+    if given is reference or (not traced and np.array_equal(reference, given)):  # a program may return an equal copy
         return None
     single = np.isin(scene.model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)))
     address, dof = scene.model.jnt_qposadr[single], scene.model.jnt_dofadr[single]
@@ -35,9 +36,9 @@ def encoder_error(scene: Scene, model: Any) -> jax.Array | None:
 
 
 def misplaced_compensation(model: Any, pose: Any, error: jax.Array | None) -> jax.Array | None:
-    """[nv] N m: gravity compensation where the encoders say that the joints are, less that where they are.
+    """[nv] N m, gravity compensation at the encoders' readings minus that at the true positions.
 
-    None where nothing is compensated, or no encoder is off.
+    None if nothing is compensated, or `error` is None.
     """
     if error is None or not model.flg_gravcomp or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         return None
@@ -45,5 +46,5 @@ def misplaced_compensation(model: Any, pose: Any, error: jax.Array | None) -> ja
 
 
 def misplaced_weight(model: Any, pose: Any, error: jax.Array) -> jax.Array:
-    """[nv] N m that a torque whose weight was taken out where the encoders say still holds of it."""
+    """[nv] N m, gravity that remains in a torque from which it was subtracted at the encoders' readings."""
     return change_of_force(model, pose, model.body_mass, model.opt.gravity, -error)

@@ -1,4 +1,4 @@
-"""Make any quantity of an MJCF a parameter, in a line.
+"""Make any number of an MJCF a parameter.
 
     space = Space((
         joint_damping(scene, "elbow", mean=1.0, std=0.5, high=20.0),
@@ -6,8 +6,7 @@
         model_parameter(scene, "pair_friction", "left_near", 0, name="grip", unit="-", std=0.2, high=4),
     ))
 
-Every function resolves names to ids once and raises ValueError, listing the valid names, for
-one that the scene does not have.
+Every function resolves names to ids once.  For an unknown name it raises ValueError and lists the valid ones.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ _KIND = {
     "pair": "pair",
     "actuator": "actuator",
 }
-# field -> whether an element's limit of it acts at all, which is fixed when the model is compiled
+# field of a limit -> field that says whether the limit is active, which is fixed at compilation
 _LIMITED = {
     "actuator_forcerange": "actuator_forcelimited",
     "actuator_ctrlrange": "actuator_ctrllimited",
     "jnt_range": "jnt_limited",
     "jnt_actfrcrange": "jnt_actfrclimited",
 }
-_POSITION_GAIN = (("actuator_gainprm", 0), ("actuator_biasprm", 1))  # both of them, with opposite signs
+_POSITION_GAIN = (("actuator_gainprm", 0), ("actuator_biasprm", 1))  # a position servo's, with opposite signs
 ENCODER = "encoder_offset"
-_SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and their column of the velocity gain
+_SERVO, _VELOCITY_GAIN = ("actuator_gainprm", "actuator_biasprm"), 2  # fields, and the column of the velocity gain
 
 
 def element_index(scene: Scene, field: str, element: str) -> int:
@@ -60,9 +59,9 @@ def element_index(scene: Scene, field: str, element: str) -> int:
 
 
 def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str:
-    """Name of the element that an entry of a model field belongs to, "" where it has none.
+    """Name of the element to which an entry of a model field belongs; "" if it has none.
 
-    Of an actuator without a name it is its joint's.
+    An actuator without a name has its joint's.
     """
     if field in ("qpos0", "qpos_spring"):
         return model.joint(int(np.searchsorted(model.jnt_qposadr, index[0], side="right")) - 1).name
@@ -71,18 +70,19 @@ def element_name(model: mujoco.MjModel, field: str, index: Sequence[int]) -> str
         return ""
     number = model.dof_jntid[index[0]] if kind == "dof" else index[0]
     name = getattr(model, _KIND[kind])(number).name
-    if not name and kind == "actuator" and drives_joint(model)[number]:  # most servos have no name of their own
+    if not name and kind == "actuator" and drives_joint(model)[number]:  # most servos have no name
         return model.joint(model.actuator_trnid[number, 0]).name
     return name
 
 
-TURNS = 1  # MjModel.body_simple of a body that may turn; of one that only slides it is 2, and nothing is coupled
+TURNS = 1  # MjModel.body_simple of a body that may rotate; 2 is a body that only slides, without coupling
 
 
 def _refuse_uncoupled(scene: Scene, p: Parameter, write: Write) -> None:
-    """ValueError where C would leave out what a moved centre, or joint, couples.
+    """Raise ValueError if C MuJoCo would ignore the inertial coupling that a displaced centre of mass or joint causes.
 
-    Where several joints of a body go through its centre along its axes, MuJoCo compiles an inertia without coupling.
+    If several joints of a body pass through its centre of mass along its axes, MuJoCo compiles an inertia without
+    coupling.
     """
     model, (first, *_) = scene.model, write.index
     if write.field in ("body_ipos", "body_iquat", PSEUDO_INERTIA):
@@ -96,13 +96,13 @@ def _refuse_uncoupled(scene: Scene, p: Parameter, write: Write) -> None:
         name = model.body(body).name
         raise ValueError(
             f"parameter {p.name!r}: MuJoCo compiles body {name!r} without coupling between its "
-            f"{model.body_dofnum[body]} degrees of freedom, since its inertia lies in its own frame; give its "
-            '<inertial> a pos beside it in the MJCF, such as pos="0 0 1e-6"'
+            f"{model.body_dofnum[body]} degrees of freedom, since its inertial frame is its body frame; displace its "
+            '<inertial> in the MJCF, such as by pos="0 0 1e-6"'
         )
 
 
 def check_space(scene: Scene, space: Space) -> None:
-    """ValueError where a space writes entries that the scene's model does not have, or has of another element."""
+    """Raise ValueError if a space writes entries that the scene's model lacks, or that belong to another element."""
     check_single_inertia(space)
     for p in space.parameters:
         for w in p.writes:
@@ -118,11 +118,11 @@ def check_space(scene: Scene, space: Space) -> None:
                     f"{f' of {w.element!r}' if w.element else ''}, but in {scene.name!r} that field has shape "
                     f"{array.shape}: it belongs to another scene"
                 )
-            own = element_name(scene.model, w.field, w.index)
-            if w.element and w.element != own:
+            element = element_name(scene.model, w.field, w.index)
+            if w.element and w.element != element:
                 raise ValueError(
                     f"parameter {p.name!r} writes {w.field} of {w.element!r}, but in {scene.name!r} that entry is of "
-                    f"{own or 'an element without a name'!r}: it belongs to another scene"
+                    f"{element or 'an element without a name'!r}: it belongs to another scene"
                 )
             _refuse_uncoupled(scene, p, w)
 
@@ -130,13 +130,13 @@ def check_space(scene: Scene, space: Space) -> None:
 def write(
     scene: Scene, field: str, index: tuple[int, ...], mode: Mode = Mode.SET, *, gain: float = 1.0, offset: float = 0.0
 ) -> Write:
-    """A `Write` that knows the name of its element.
+    """A `Write` with the name of its element.
 
-    Raises ValueError for the place of a mocap body, which is no part of the model in a replay.
+    Raises ValueError for the pose of a mocap body, which a replay does not read from the model.
     """
     if field in ("body_pos", "body_quat") and scene.model.body_mocapid[index[0]] >= 0:
         name = element_name(scene.model, field, index)
-        raise ValueError(f"body {name!r} is a mocap body, whose place no parameter can be: take mocap out of the MJCF")
+        raise ValueError(f"body {name!r} is a mocap body, whose pose cannot be a parameter: remove mocap from the MJCF")
     return Write(field, index, mode, gain, offset, element_name(scene.model, field, index))
 
 
@@ -157,9 +157,24 @@ def model_parameter(
 ) -> Parameter:
     """A parameter that is one number of a model field.
 
-    field, element, column: e.g. "dof_damping", "hinge", None or "geom_size", "knob", 0.
-    mean: default is the value that leaves the model's own number as it is.
-    options: further fields of `Parameter` (nuisance, group, scaling, log_offset, width).
+    Args:
+        scene: with the element.
+        field: of MjModel, such as "dof_damping" or "geom_size".
+        element: name of the joint, body, geom, pair or actuator.
+        column: of the field, if it has several numbers for each element.
+        name: of the parameter; None: made of element and field.
+        unit: of the number.
+        std: prior deviation.
+        mean: prior mean; None: the value that leaves the model's number unchanged.
+        low, high: bounds.
+        mode: how the value enters the field.
+        options: further fields of `Parameter` (nuisance, group, scaling, log_offset, width).
+
+    Returns:
+        The parameter.
+
+    Raises:
+        ValueError: the field, element or column does not exist, or a change of the number has no effect in a replay.
     """
     from droid_jax.model.physics import check_field  # only here: it imports jax, which may have to be tuned first
 
@@ -174,9 +189,9 @@ def model_parameter(
         _check_servo_damping(scene, element)
     if (field, column) in _POSITION_GAIN:
         _check_whole_servo(scene, element, first)
-    own = write(scene, field, index, mode)
+    first_write = write(scene, field, index, mode)
     if mean is None:
-        mean = float(own.neutral(np.asarray(getattr(scene.model, field))[index]))
+        mean = float(first_write.neutral(np.asarray(getattr(scene.model, field))[index]))
     return Parameter(
         name or f"{element}_{field.split('_', 1)[1]}",
         unit,
@@ -184,13 +199,16 @@ def model_parameter(
         std,
         low,
         high,
-        writes=(own, *(replace(own, index=(row, *columns)) for row in _further_dofs(scene, field, first))),
+        writes=(
+            first_write,
+            *(replace(first_write, index=(row, *columns)) for row in _further_dofs(scene, field, first)),
+        ),
         **options,
     )
 
 
 def _column(scene: Scene, field: str, column: int | None) -> tuple[int, ...]:
-    """The part of an index behind the element's: nothing, or the column, or ValueError that says which there are."""
+    """The index after the element's: empty, or the column; ValueError lists the columns."""
     width = np.asarray(getattr(scene.model, field)).shape[1:]
     if not width:
         if column is not None:
@@ -206,19 +224,19 @@ def _column(scene: Scene, field: str, column: int | None) -> tuple[int, ...]:
 
 
 def _further_dofs(scene: Scene, field: str, first: int) -> range:
-    """The other rows of a ball's or free joint's number, which an MJCF states once for all its degrees of freedom."""
+    """The other rows of a ball or free joint, whose degrees of freedom share one number in an MJCF."""
     if not field.startswith("dof_"):
         return range(0)
     return range(first + 1, first + int(np.sum(scene.model.dof_jntid == scene.model.dof_jntid[first])))
 
 
 def _check_limited(scene: Scene, field: str, element: str, index: int) -> None:
-    """ValueError for a limit that the model was compiled without: it would never act."""
+    """Raise ValueError for a limit that is not active in the compiled model."""
     flag = _LIMITED.get(field)
     if flag and not getattr(scene.model, flag)[index]:
         raise ValueError(
-            f"{element!r} was compiled without the limit that {field} is of, which a replay can never switch on; "
-            "give it one in the MJCF"
+            f"{element!r} was compiled without the limit {field}, which a replay cannot activate; give it one in the "
+            "MJCF"
         )
 
 
@@ -234,7 +252,7 @@ def _check_whole_servo(scene: Scene, actuator: str, index: int) -> None:
     gain, bias = scene.model.actuator_gainprm[index, 0], scene.model.actuator_biasprm[index, 1]
     if gain and bias == -gain:
         raise ValueError(
-            f"actuator {actuator!r} is a position servo, whose gain is in gainprm and in biasprm: one of them alone "
+            f"actuator {actuator!r} is a position servo, whose gain is in gainprm and in biasprm: a change of one "
             'would pull it towards zero; vary both with servo_scale(scene, joint) ({"servo": joint, "std": 0.03})'
         )
 
@@ -242,53 +260,55 @@ def _check_whole_servo(scene: Scene, actuator: str, index: int) -> None:
 def _check_frictionloss(scene: Scene, joint: str) -> None:
     if scene.model.dof_frictionloss[scene.dof(joint)] < TINY_FRICTIONLOSS:
         raise ValueError(
-            f"joint {joint!r} was compiled with friction loss 0, which MJX can never raise; "
+            f"joint {joint!r} was compiled with friction loss 0, which MJX cannot change; "
             f"give it {TINY_FRICTIONLOSS:g} in the MJCF or name it in load_scene(friction_joints=...)"
         )
 
 
 def shared(parameters: Sequence[Parameter], name: str | None = None) -> Parameter:
-    """One parameter that writes what several write: servos of one type have one armature.
+    """One parameter with the writes of several, such as one armature of all servos of a type.
 
     Args:
-        parameters: alike but for what they write, such as `model_parameter` of each joint.
+        parameters: that differ in their writes only, such as `model_parameter` of each joint.
         name: of the shared one; None joins the names with "+".
 
+    Returns:
+        The first parameter with the writes of all.
+
     Raises:
-        ValueError: none is given, one of them writes no field of the model, or they start from different numbers of
-            the model, none of which can stand for all.
+        ValueError: the list is empty, a parameter writes no field of the model, or their means differ.
     """
     if not parameters:
-        raise ValueError("a shared parameter needs at least one that it is made of")
+        raise ValueError("a shared parameter needs at least one parameter")
     first = parameters[0]
     if absent := [p.name for p in parameters if not p.writes]:
         raise ValueError(f"parameters {', '.join(absent)} write no field of the model, so they cannot be shared")
     if other := [p for p in parameters if not np.isclose(p.mean, first.mean, rtol=1e-9, atol=0.0)]:
         raise ValueError(
-            f"{first.name} is {first.mean:g} in the model and {other[0].name} is {other[0].mean:g}: state the mean "
-            'from which both start, or scale each own number ("mode": "scale", as Mode.SCALE)'
+            f"{first.name} is {first.mean:g} in the model and {other[0].name} is {other[0].mean:g}: state a common "
+            'mean, or scale the number of each ("mode": "scale", as Mode.SCALE)'
         )
     joined = "+".join(dict.fromkeys(p.name for p in parameters)) if name is None else name
     return replace(first, name=joined, writes=tuple(w for p in parameters for w in p.writes))
 
 
 def joint_damping(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
-    """Viscous damping of a joint, N m s/rad; log-scaled unless told otherwise."""
+    """Viscous damping of a joint, N m s/rad; log-scaled by default."""
     options = {"unit": "N m s/rad", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "dof_damping", joint, std=std, high=high, **options)
 
 
 def joint_stiffness(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
-    """Spring stiffness of a joint about its `springref`, N m/rad; log-scaled unless told otherwise."""
+    """Spring stiffness of a joint about its `springref`, N m/rad; log-scaled by default."""
     options = {"unit": "N m/rad", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "jnt_stiffness", joint, std=std, high=high, **options)
 
 
 def joint_frictionloss(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
-    """Dry friction of a joint, N m; log-scaled unless told otherwise.
+    """Dry friction of a joint, N m; log-scaled by default.
 
-    Raises ValueError where the model was compiled with friction loss 0: MJX lays the constraint
-    row out at compilation, so it could never be raised (see `load_scene(friction_joints=...)`).
+    Raises ValueError if the model was compiled with friction loss 0: MJX lays constraint rows out at compilation, so
+    the joint has none (see `load_scene(friction_joints=...)`).
     """
     options = {"unit": "N m", "scaling": Scaling.LOG, "log_offset": 0.05, **options}
     return model_parameter(scene, "dof_frictionloss", joint, std=std, high=high, **options)
@@ -304,15 +324,15 @@ def body_mass(
     high: float,
     **options: Any,
 ) -> Parameter:
-    """Mass of one body, kg; its inertia scales with it, as for a body of one material.
+    """Mass of a body, kg; its inertia scales with it, as for a body of uniform density.
 
-    The search coordinate is logarithmic above the initial mean and linear below: what a mass does
-    is linear in it, and in a plain logarithm nothing would lead away from a mass near zero.
+    The search coordinate is logarithmic above the initial mean and linear below.  The effect of a mass is linear in it.
+    In a plain logarithm the gradient would vanish near zero.
     """
     index = scene.id("body", body)
     nominal = float(scene.model.body_mass[index])
     if nominal <= 0:
-        raise ValueError(f"body {body!r} has no mass of its own in this scene")
+        raise ValueError(f"body {body!r} has no mass in this scene")
     mean = nominal if mean is None else mean
     options = {"name": f"{body}_mass", "unit": "kg", "scaling": Scaling.LOG, "log_offset": mean, **options}
     writes = (write(scene, "body_mass", (index,)), *_inertia(scene, index, Mode.SCALE, 1.0 / nominal))
@@ -322,8 +342,8 @@ def body_mass(
 def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: Any) -> Parameter:
     """Factor on a body's mass and inertia, 1 at nominal.
 
-    The robot's controller goes on compensating the gravity of the nominal mass (gravcomp is
-    divided by the factor), so an error of the factor is felt as gravity torque.
+    The robot's controller still compensates the gravity of the nominal mass (gravcomp is divided by the factor).  So a
+    factor other than one causes a gravity torque.
     """
     index = scene.id("body", body)
     writes = (write(scene, "body_mass", (index,), Mode.SCALE), *_inertia(scene, index, Mode.SCALE, 1.0))
@@ -334,7 +354,7 @@ def body_mass_scale(scene: Scene, body: str, *, std: float = 0.03, **options: An
 
 
 def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) -> Parameter:
-    """Factor on the position gain of a joint's servo, or on that of one that follows a speed alone; 1 at nominal."""
+    """Factor on the position gain of a joint's servo, or on the gain of a velocity servo; 1 at nominal."""
     if joint not in scene.driven_joints:
         raise ValueError(f"no actuator drives {joint!r}; driven joints: {', '.join(scene.driven_joints)}")
     actuator = scene.command_names.index(joint)
@@ -349,9 +369,9 @@ def servo_scale(scene: Scene, joint: str, *, std: float = 0.03, **options: Any) 
 
 
 def joint_encoder_offset(scene: Scene, joint: str, *, std: float, high: float, **options: Any) -> Parameter:
-    """How much further a joint stands than its encoder says, rad (m for slides); 0 at nominal (`model.encoders`).
+    """Joint position minus encoder reading, rad (m for slides); 0 at nominal (`model.encoders`).
 
-    Reference, spring and range of a joint are told in what its encoder reads: all go down by the offset.
+    The joint's positions in the model are encoder readings, so reference, spring and range decrease by the offset.
     """
     row, address = scene.id("joint", joint), scene.qpos(joint)
     entries = [("qpos0", (address,)), ("qpos_spring", (address,))]
@@ -379,9 +399,8 @@ def body_position(scene: Scene, body: str, axis: int, *, std: float, limit: floa
 def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: Any) -> Parameter:
     """Small rotation of a body about its z axis, rad; 0 at nominal.
 
-    Written as the quaternion (1, 0, 0, yaw / 2), which is normalised where it is applied: right to third
-    order in the angle.
-    Raises ValueError unless the body is upright in its parent.
+    It is written as the quaternion (1, 0, 0, yaw / 2), which is normalised when it is applied.  The error is of third
+    order in the angle.  Raises ValueError if the body is rotated in its parent.
     """
     index = scene.id("body", body)
     if not np.allclose(scene.model.body_quat[index], [1, 0, 0, 0]):
@@ -391,7 +410,7 @@ def body_yaw(scene: Scene, body: str, *, std: float, limit: float, **options: An
 
 
 def capsule_radius(scene: Scene, geom: str, *, std: float, limit: float, **options: Any) -> Parameter:
-    """Change of a capsule's radius, m; 0 at nominal. Mass and inertia stay."""
+    """Change of a capsule's radius, m; 0 at nominal. Mass and inertia are unchanged."""
     index = scene.id("geom", geom)
     fields = [("geom_size", (index, 0)), ("geom_rbound", (index,))]
     fields += [("geom_aabb", (index, k)) for k in (3, 4, 5)]
@@ -403,10 +422,10 @@ def capsule_radius(scene: Scene, geom: str, *, std: float, limit: float, **optio
 def pair_friction(
     scene: Scene, pairs: Sequence[str], columns: Sequence[int], *, std: float, **options: Any
 ) -> Parameter:
-    """Friction of explicit contact pairs (MJX reads pair_friction for these, never geom_friction).
+    """Friction of explicit contact pairs, whose pair_friction replaces geom_friction.
 
-    columns: 0 and 1 sliding (-), 2 torsional (m).
-    Below 0.05 a pyramidal cone is too steep for float32 (its rows scale with the friction squared).
+    columns: 0 and 1 sliding (-), 2 torsional (m).  The lower bound is 0.05 by default: below it a pyramidal cone is too
+    steep for float32 (its rows scale with the friction squared).
     """
     ids = [scene.id("pair", p) for p in pairs]
     writes = tuple(write(scene, "pair_friction", (i, c)) for i in ids for c in columns)
@@ -420,5 +439,5 @@ def _inertia(scene: Scene, body: int, mode: Mode, gain: float) -> tuple[Write, .
 
 
 def time_offset(std: float = 0.001, limit: float = 0.05) -> Parameter:
-    """Delay of the command against the measurement's clock, s (read by the replay, not by the model)."""
+    """Delay of the command relative to the measurement's clock, s; the replay reads it from theta."""
     return Parameter(Role.TIME_OFFSET.value, "s", 0.0, std, -limit, limit, nuisance=True, group="Nuisance")

@@ -1,4 +1,4 @@
-"""What a uniform field, as gravity is, does to the joints of a model, and what it would do a little way off."""
+"""Generalised force of a uniform field (gravity) on a model, and its change with small joint displacements."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from droid_jax.runtime import first_device
 
 
 class Carried(NamedTuple):
-    """What each degree of freedom carries, of a mass [nbody] kg that a field acts on.
+    """The mass that each degree of freedom carries.
 
-    axis: [nv, 3] unit vectors; turns: [nv] 1 of a rotation, 0 of a slide.
-    mass: [nv] kg.  moment: [nv, 3] kg m about the joint's own anchor.
+    Attributes:
+        axis: [nv, 3] unit vectors.
+        turns: [nv] 1 for a rotation, 0 for a slide.
+        mass: [nv] kg.
+        moment: [nv, 3] kg m, first moment of that mass about the joint's anchor.
     """
 
     axis: jax.Array
@@ -27,7 +30,7 @@ class Carried(NamedTuple):
 
 
 def lean(field: jax.Array, axis: int, angle: jax.Array) -> jax.Array:
-    """A vector [3] turned by an angle [] rad about an axis of the world: 0, 1 or 2."""
+    """A vector [3] rotated by an angle [] rad about a world axis: 0, 1 or 2."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     turned = jnp.asarray(field).at[first].set(cosine * field[first] - sine * field[second])
@@ -59,10 +62,11 @@ def field_force(model: Any, pose: Any, mass: jax.Array, field: jax.Array) -> jax
 
 
 def change_of_force(model: Any, pose: Any, mass: jax.Array, field: jax.Array, step: jax.Array) -> jax.Array:
-    """[nv] by how much `field_force` changes where each degree of freedom goes on by a small step [nv], rad or m.
+    """[nv] change of `field_force` for a small displacement [nv] of the degrees of freedom, rad or m.
 
-    The slope at half the way, where axes and moments are taken to first order: right to the third order of the step (a
-    ten-thousandth at 0.03 rad).  Of hinges and slides; degrees of freedom of free and ball joints do not step.
+    The derivative at half the displacement, with axes and moments to first order: exact to the third order of the
+    displacement (a relative error of 1e-4 at 0.03 rad).  It applies to hinges and slides; the displacement of free and
+    ball joints must be zero.
     """
     here = _carried(model, pose, mass)
     axes, moments, _ = _slope(model, here, field, 0.5 * step)
@@ -71,9 +75,9 @@ def change_of_force(model: Any, pose: Any, mass: jax.Array, field: jax.Array, st
 
 
 def _slope(model: Any, here: Carried, field: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What a step [nv] changes, to first order: axes [nv, 3], moments [nv, 3] and forces [nv].
+    """First-order changes of axes [nv, 3], moments [nv, 3] and forces [nv] for a displacement [nv].
 
-    A step of a joint turns (or shifts) whatever it carries, its own axis and moment included.
+    A displacement of a joint turns (or shifts) everything that it carries, including its own axis and moment.
     """
     above = jnp.asarray(_above(model), step.dtype)  # [nv, nv] row: of these, which carry it, itself included
     beyond = above.T - jnp.eye(above.shape[0], dtype=step.dtype)  # row: those that it carries, without itself
@@ -107,7 +111,7 @@ def _moved(model: Any) -> np.ndarray:
 
 
 def _above(model: Any) -> np.ndarray:
-    """[nv, nv] True where the column's degree of freedom moves the row's joint, or is the row's."""
+    """[nv, nv] True where the column's degree of freedom moves the row's joint, or is the same."""
     moves = _moved(model)[model.dof_bodyid]
     same = np.equal.outer(model.dof_bodyid, model.dof_bodyid)  # of joints of one body the first carries the others
     order = np.arange(model.nv)

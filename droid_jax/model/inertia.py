@@ -1,26 +1,24 @@
-"""Inertia of bodies: moments that no body can have, and ten parameters whose every value is a body that can exist.
+"""Physical consistency of inertias: a check of separate moments, and a parameterisation that is always consistent.
 
-No body's largest principal moment is above the sum of the others (A + B < C).  Moments that are parameters one by one
-can come to that.  A row of values with it is no sample of a search and no draw of a distribution: the replay of it
-counts as one that gave no numbers, and draws are drawn again.
+The largest principal moment of a body is at most the sum of the others (C <= A + B).  Parameters that are single
+moments can violate this.  The replay of such a vector counts as not finite in a search, and a draw of a distribution is
+repeated.  The parameterisation of a whole inertia by ten parameters cannot violate it.
 
-The whole inertia as ten parameters has no such rows.
-
-A body's mass, centre and moments make its pseudo-inertia, a symmetric matrix of four rows:
+A body's mass, centre of mass and moments form its pseudo-inertia, a symmetric matrix [4, 4]:
 
     J = [[S, h], [h', m]]      S = sum of mass times position position',  h = mass times centre
 
-A body can have these numbers if and only if J is positive definite.  With the scene's own J = U0 U0' (U0 upper
-triangular) ten numbers z make another one, J(z) = U0 A(z) A(z)' U0', where A is upper triangular too:
+The numbers are physically consistent if and only if J is positive definite.  With the scene's J = U0 U0' (U0 upper
+triangular), ten numbers z give another one, J(z) = U0 A(z) A(z)' U0', where A is upper triangular too:
 
     A = e^mass [[e^stretch_x, shear_xy,    shear_xz,    shift_x],
                 [0,           e^stretch_y, shear_yz,    shift_y],
                 [0,           0,           e^stretch_z, shift_z],
                 [0,           0,           0,           1      ]]
 
-z = 0 is the scene's own body.  A shift of 1 moves the centre by about a radius of gyration; mass 0.05 is 10 % heavier.
-The numbers are entries of a field `body_pseudo_inertia` [nbody, 10], which no MuJoCo model has: applying values turns
-it into mass, centre, orientation and moments (`inertial_fields`).
+z = 0 is the scene's body.  A shift of 1 moves the centre of mass by about a radius of gyration; mass 0.05 is 10 %
+heavier.  Parameters write the numbers to a field `body_pseudo_inertia` [nbody, 10], which no MuJoCo model has.
+Applying values converts it to mass, centre of mass, orientation and moments (`inertial_fields`).
 
 Source: Rucker and Wensing, Smooth parameterization of rigid-body inertia, IEEE RA-L 2022.
 """
@@ -38,21 +36,21 @@ import numpy as np
 from droid_jax.model.parameters import Parameter, Space, Write
 from droid_jax.model.scene import Scene
 
-ROUNDING = 1e-5  # of the largest moment, by which single precision may miss the inequality
+ROUNDING = 1e-5  # of the largest moment, by which rounding to single precision may violate the inequality
 PSEUDO_INERTIA = "body_pseudo_inertia"
 TERMS = (
     *("mass", "stretch_x", "stretch_y", "stretch_z", "shear_xy", "shear_yz", "shear_xz"),
     *("shift_x", "shift_y", "shift_z"),
 )
-WEIGHTS = ("body_mass", "body_ipos", "body_iquat", "body_inertia")  # what MuJoCo has for it
-FLAT = 1e-6  # share of the largest of a body's three extents squared that each must be
+WEIGHTS = ("body_mass", "body_ipos", "body_iquat", "body_inertia")  # MuJoCo's fields of an inertia
+FLAT = 1e-6  # least squared extent of a body along an axis, as a share of the largest
 
 
 # ----- moments one by one
 
 
-def free_inertias(scene: Scene, space: Space) -> dict[int, list[tuple[int, Write]]]:
-    """Body -> (column of the vector, write) of its inertia, of those bodies whose moments do not scale as one."""
+def free_inertias(space: Space) -> dict[int, list[tuple[int, Write]]]:
+    """Body -> (column of the vector, write) of its moments, for bodies whose moments do not scale by one factor."""
     writes = dict[int, list[tuple[int, Write]]]()
     for column, parameter in enumerate(space.parameters):
         for write in parameter.writes:
@@ -63,37 +61,37 @@ def free_inertias(scene: Scene, space: Space) -> dict[int, list[tuple[int, Write
 
 
 def inertia_possible(scene: Scene, space: Space, values: Any) -> Any:
-    """[...] bool of values [..., D], numpy or jax: whether every body's inertia is one that a body can have."""
-    found = None
-    for body, writes in free_inertias(scene, space).items():
+    """[...] bool, whether all inertias are physically consistent for values [..., D], numpy or jax."""
+    possible = None
+    for body, writes in free_inertias(space).items():
         first, second, third = _moments(scene, body, writes, lambda column: values[..., column])
         total = first + second + third
-        fits = (2 * first <= total * (1 + ROUNDING)) & (2 * second <= total * (1 + ROUNDING))
-        fits = fits & (2 * third <= total * (1 + ROUNDING)) & (first > 0) & (second > 0) & (third > 0)
-        found = fits if found is None else found & fits
-    return np.ones(np.shape(values)[:-1], bool) if found is None else found
+        of_body = (2 * first <= total * (1 + ROUNDING)) & (2 * second <= total * (1 + ROUNDING))
+        of_body = of_body & (2 * third <= total * (1 + ROUNDING)) & (first > 0) & (second > 0) & (third > 0)
+        possible = of_body if possible is None else possible & of_body
+    return np.ones(np.shape(values)[:-1], bool) if possible is None else possible
 
 
 def check_inertia(scene: Scene, space: Space) -> None:
-    """Warn of bounds that hold an inertia which no body can have; ValueError where the initial means are one.
+    """Warn if the bounds allow an inertia that no body can have; raise ValueError if the initial means are one.
 
     The message names the body, its parameters and the moments.
     """
-    for body, writes in free_inertias(scene, space).items():
+    for body, writes in free_inertias(space).items():
         names = ", ".join(dict.fromkeys(space.parameters[column].name for column, _ in writes))
-        called = f"body {scene.model.body(body).name!r} of scene {scene.name!r}"
+        label = f"body {scene.model.body(body).name!r} of scene {scene.name!r}"
         means = _moments(scene, body, writes, lambda column: space.mean[column])
         if not bool(inertia_possible(scene, _only(space, writes), np.array([space.mean[c] for c in _columns(writes)]))):
             raise ValueError(
-                f"the initial means of {names} give {called} the principal moments {_said(means)} kg m2, of which the "
+                f"the initial means of {names} give {label} the principal moments {_listed(means)} kg m2, of which the "
                 "largest is above the sum of the others: no body has that inertia"
             )
         worst = _worst(scene, body, writes, space)
         if worst is not None:
             warnings.warn(
-                f"the bounds of {names} hold moments that {called} cannot have ({_said(worst)} kg m2: the largest is "
-                "above the sum of the others); such rows are left out of the search and of draws: narrow the bounds, "
-                "or vary the mass alone (body_mass, which scales the inertia)",
+                f"the bounds of {names} allow moments that {label} cannot have ({_listed(worst)} kg m2: the largest is "
+                "above the sum of the others); searches and draws leave such values out: narrow the bounds, or vary "
+                "the mass only (body_mass, which scales the inertia)",
                 stacklevel=3,
             )
 
@@ -101,17 +99,17 @@ def check_inertia(scene: Scene, space: Space) -> None:
 def possible_draws(
     scene: Scene, space: Space, draw: Callable[[int], np.ndarray], n: int, rounds: int = 100
 ) -> np.ndarray:
-    """[n, D] draws of which those with an inertia that no body can have are drawn again.
+    """[n, D] draws; those with an inertia that no body can have are repeated.
 
     Args:
         scene: of the parameters.
-        space: what a row of the draws means.
-        draw: [k, D] new rows.
-        n: rows.
-        rounds: of drawing again.
+        space: meaning of a row.
+        draw: k -> [k, D] new draws.
+        n: number of draws.
+        rounds: most repetitions.
 
     Raises:
-        ValueError: where even then some are left.
+        ValueError: some draws are still inconsistent after that.
     """
     values = draw(n)
     for _ in range(rounds):
@@ -126,14 +124,14 @@ def possible_draws(
 
 
 def _alone(writes: list[tuple[int, Write]], column: int) -> bool:
-    """Whether a parameter changes a body's moments other than all three by one factor."""
-    mine = [write for c, write in writes if c == column]
-    alike = {(w.mode, w.gain, w.offset) for w in mine}
-    return len(mine) != 3 or len(alike) != 1 or mine[0].mode.value not in ("scale", "divide")
+    """Whether a parameter changes a body's moments in another way than all three by one factor."""
+    of_column = [write for c, write in writes if c == column]
+    rules = {(w.mode, w.gain, w.offset) for w in of_column}
+    return len(of_column) != 3 or len(rules) != 1 or of_column[0].mode.value not in ("scale", "divide")
 
 
 def _moments(scene: Scene, body: int, writes: list[tuple[int, Write]], value: Callable[[int], Any]) -> list[Any]:
-    """The three principal moments, kg m2, with the writes applied in the order in which the model takes them."""
+    """The three principal moments, kg m2, after the writes in their order."""
     moments: list[Any] = [float(m) for m in scene.model.body_inertia[body]]
     for column, write in writes:
         moments[write.index[1]] = write.new(moments[write.index[1]], value(column))
@@ -149,9 +147,9 @@ def _only(space: Space, writes: list[tuple[int, Write]]) -> Space:
 
 
 def _worst(scene: Scene, body: int, writes: list[tuple[int, Write]], space: Space) -> list[float] | None:
-    """Moments at the corner of the bounds that breaks the inequality the most, None where none does.
+    """The moments at the corner of the bounds that violates the inequality the most; None if no corner does.
 
-    Every moment rises or falls with each of its parameters, so the corners hold the extremes.
+    Each moment is monotonic in each of its parameters, so the extremes are at corners.
     """
     columns, worst, most = _columns(writes), None, ROUNDING
     corners = np.array(np.meshgrid(*([0, 1] for _ in columns), indexing="ij")).reshape(len(columns), -1).T
@@ -164,7 +162,7 @@ def _worst(scene: Scene, body: int, writes: list[tuple[int, Write]], space: Spac
     return worst
 
 
-def _said(moments: list[Any]) -> str:
+def _listed(moments: list[Any]) -> str:
     return ", ".join(f"{float(m):.3g}" for m in moments)
 
 
@@ -174,17 +172,20 @@ def _said(moments: list[Any]) -> str:
 def inertia_parameters(
     scene: Scene, body: str, *, std: float = 0.1, high: float = 1.0, **options: Any
 ) -> tuple[Parameter, ...]:
-    """The ten parameters of one body, `inertia_mass[BODY]` and so on, 0 at nominal.
+    """The ten parameters of a body's inertia, `inertia_mass[BODY]` and so on, 0 at nominal.
 
     Args:
         scene: with the body.
-        body: by name.
+        body: its name.
         std: prior deviation of each.
         high: bound of each, to both sides.
         options: further fields of `Parameter`.
 
+    Returns:
+        The parameters, in the order of `TERMS`.
+
     Raises:
-        ValueError: no such body, or one without mass or with no extent along an axis: a point, a rod, a plate.
+        ValueError: there is no such body, or it has no mass, or no extent along an axis (a point, a rod, a plate).
     """
     row = scene.id("body", body)
     check_solid(scene.model, row)
@@ -196,19 +197,19 @@ def inertia_parameters(
 
 
 def check_solid(model: mujoco.MjModel, body: int) -> None:
-    """ValueError for a body whose pseudo-inertia is not positive definite."""
+    """Raise ValueError for a body whose pseudo-inertia is not positive definite."""
     moments = model.body_inertia[body]
     extents = 0.5 * moments.sum() - moments
     if model.body_mass[body] <= 0 or extents.min() <= FLAT * max(extents.max(), 1e-300):
         raise ValueError(
             f"body {model.body(body).name!r} has mass {model.body_mass[body]:.3g} kg and moments "
-            f"{', '.join(f'{m:.3g}' for m in moments)} kg m2, those of a point, a rod or a plate: its inertia cannot "
-            "be a parameter as a whole; give the body a thickness in the MJCF, or vary its mass (body_mass)"
+            f"{', '.join(f'{m:.3g}' for m in moments)} kg m2, those of a point, a rod or a plate: its whole inertia "
+            "cannot be a parameter; give the body a thickness in the MJCF, or vary its mass (body_mass)"
         )
 
 
 def check_single_inertia(space: Space) -> None:
-    """ValueError where other parameters write the weight of a body whose whole inertia is a parameter."""
+    """Raise ValueError if other parameters write the inertia of a body whose whole inertia is a parameter."""
     whole = {w.index[0]: w.element for p in space.parameters for w in p.writes if w.field == PSEUDO_INERTIA}
     for p in space.parameters:
         if both := [whole[w.index[0]] for w in p.writes if w.field in WEIGHTS and w.index[0] in whole]:
@@ -218,12 +219,12 @@ def check_single_inertia(space: Space) -> None:
 
 
 def nominal_field(model: Any, field: str) -> Any:
-    """A field's own numbers: of a model, C's or MJX's, or of body_pseudo_inertia, which has none yet."""
+    """A field of a model, of C or MJX; zeros for body_pseudo_inertia, which models do not have."""
     return np.zeros((model.nbody, len(TERMS))) if field == PSEUDO_INERTIA else getattr(model, field)
 
 
 def as_written(writes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """(field, index) of MuJoCo's own fields; a body's whole inertia is four of them."""
+    """(field, index) with body_pseudo_inertia replaced by MuJoCo's four fields of an inertia."""
     out: dict[tuple[str, tuple[int, ...]], None] = {}
     for field, index in writes:
         out.update(dict.fromkeys([(f, index[:1]) for f in WEIGHTS] if field == PSEUDO_INERTIA else [(field, index)]))
@@ -231,20 +232,23 @@ def as_written(writes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[tuple[s
 
 
 def inertial_fields(model: mujoco.MjModel, body: int, terms: Any, xp: ModuleType = np) -> dict[str, Any]:
-    """The numbers of `WEIGHTS` of a body for its ten terms.
+    """The fields `WEIGHTS` of a body for its ten numbers z.
 
     Args:
-        model: with the body's own numbers.
-        body: its row.
-        terms: [10], numpy's or jax's.
+        model: with the nominal body.
+        body: its id.
+        terms: [10] z, numpy or jax.
         xp: numpy or jax.numpy.
+
+    Returns:
+        Field -> its row: mass [] kg, centre of mass [3] m, quaternion [4], moments [3] kg m2.
     """
     root = root_of(*(np.asarray(getattr(model, f)[body], float) for f in WEIGHTS))
     scaled = xp.asarray(root, terms.dtype) @ _factor(terms, xp)
     whole = scaled @ scaled.T
     mass = whole[3, 3]
     centre = whole[:3, 3] / mass
-    spread = whole[:3, :3] - mass * xp.outer(centre, centre)  # about the centre
+    spread = whole[:3, :3] - mass * xp.outer(centre, centre)  # about the centre of mass
     extents, axes = xp.linalg.eigh(spread)  # ascending, so that moments descend, as MuJoCo has them
     axes = axes * xp.asarray([1.0, 1.0, xp.sign(xp.linalg.det(axes))])
     moments = xp.sum(extents) - extents
@@ -252,7 +256,7 @@ def inertial_fields(model: mujoco.MjModel, body: int, terms: Any, xp: ModuleType
 
 
 def root_of(mass: np.ndarray, centre: np.ndarray, quaternion: np.ndarray, moments: np.ndarray) -> np.ndarray:
-    """[4, 4] upper triangular U0 with U0 U0' the pseudo-inertia."""
+    """[4, 4] upper triangular U0, so that U0 U0' is the pseudo-inertia."""
     turned = np.zeros(9)
     mujoco.mju_quat2Mat(turned, quaternion)
     axes = turned.reshape(3, 3)
@@ -278,7 +282,7 @@ def _factor(terms: Any, xp: ModuleType) -> Any:
 
 
 def _quaternion(axes: Any, xp: ModuleType) -> Any:
-    """[4] unit quaternion of a rotation [3, 3], from the largest of four ways to work it out."""
+    """[4] unit quaternion of a rotation [3, 3], by the best conditioned of four formulas."""
     ((a, b, c), (d, e, f), (g, h, i)) = axes
     ways = xp.stack([
         xp.stack([1 + a + e + i, h - f, c - g, d - b]),

@@ -1,13 +1,12 @@
-"""What the torque sensor of a joint adds: friction as it sees it on the link side, a constant, a gain.
+"""The model of a joint's torque sensor: link-side friction, a constant offset, a gain error.
 
     tau += viscous * qd + coulomb * tanh(qd / SMOOTHING) + torque_offset        [N m]
 
-These are observation parameters: they change what is read, not how the arm moves.  The model's own
-`joint_damping` and `joint_frictionloss` lie on the motor side, where a link-side sensor cannot see
-them; what it does see is friction of the bearings behind it.  Model: the linear friction of Gaz et al.,
-RA-L 2019, with a smooth sign (`direction`).
+These parameters change the measured torque, not the motion.  The model's `joint_damping` and `joint_frictionloss` are
+on the motor side, which a link-side sensor does not measure.  It measures the friction of the bearings between sensor
+and link.  The model is the linear friction of Gaz et al., RA-L 2019, with a smooth sign (`direction`).
 
-A torque sensor of another gain reads (1 + torque_gain) tau.
+A torque sensor with a gain error reads (1 + torque_gain) tau.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import jax.numpy as jnp
 from droid_jax.model.effect_interface import Effect, Rollout, Theta, column
 from droid_jax.model.parameters import OF_A_JOINT, Parameter, Role, Space
 
-SMOOTHING = 0.01  # rad/s: `direction` reaches 0.96 at twice this speed
+SMOOTHING = 0.01  # rad/s, at twice this speed `direction` is 0.96
 GAIN = Role.TORQUE_GAIN.value
 TERMS = tuple(role.value for role in OF_A_JOINT)
 _UNITS = {Role.VISCOUS: "N m s/rad", Role.COULOMB: "N m", Role.TORQUE_OFFSET: "N m", Role.TORQUE_GAIN: "-"}
@@ -32,18 +31,18 @@ _DEVIATIONS = {Role.VISCOUS: 0.3, Role.COULOMB: 0.5, Role.TORQUE_OFFSET: 0.3}  #
 
 
 def direction(velocity: jax.Array) -> jax.Array:
-    """Smooth sign of a speed, rad/s; speeds well below SMOOTHING have no direction yet."""
+    """Smooth sign of a speed, rad/s; near zero for speeds well below SMOOTHING."""
     return jnp.tanh(velocity / SMOOTHING)
 
 
 def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array], jax.Array] = direction) -> Effect:
-    """Adds viscous and Coulomb friction to the torque of `joints`, the channel order of the scene.
+    """The effect that adds viscous and Coulomb friction to the torques of `joints`, in channel order.
 
-    direction: of a speed.  Along a prescribed motion jnp.sign, since samples at rest are known there (`simulate.rest`);
-    a servo's simulated joints have none.
+    It reads `viscous[joint]` and `coulomb[joint]` from theta, 0 if theta lacks them.
+    `droid_jax.simulate.replay.torque_offset_effect` adds the offset.
 
-    Reads `viscous[joint]` and `coulomb[joint]` from theta; absent means zero.  The offset is left to
-    `droid_jax.simulate.replay.torque_offset_effect`, which reads `torque_offset[joint]`.
+    direction: sign of a speed.  Along a prescribed motion it is jnp.sign, since samples at rest are treated separately
+    there (`simulate.rest`).
     """
     joints = tuple(joints)
 
@@ -58,7 +57,7 @@ def joint_friction_effect(joints: Sequence[str], direction: Callable[[jax.Array]
 
 
 def torque_gain_effect(joints: Sequence[str]) -> Effect:
-    """Torque sensors of another gain: reads `torque_gain[joint]` of `joints`, the channel order of the scene."""
+    """The effect of gain errors of torque sensors, `torque_gain[joint]` of `joints`, in channel order."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         return replace(rollout, torque=rollout.torque * (1.0 + column(theta, GAIN, joints)))
@@ -67,10 +66,10 @@ def torque_gain_effect(joints: Sequence[str]) -> Effect:
 
 
 def joint_friction_space(joints: Sequence[str]) -> Space:
-    """Three parameters a joint, `viscous[joint]`, `coulomb[joint]` and `torque_offset[joint]`, all zero at first.
+    """Three parameters for each joint, `viscous[joint]`, `coulomb[joint]` and `torque_offset[joint]`, with mean zero.
 
-    Bounds are ten deviations to either side: zero, no friction, is then no edge, and a fit that comes out
-    negative shows that something other than friction was fitted.
+    Bounds are ten deviations to either side.  So no friction is not at a bound, and a negative fit shows that it
+    describes something other than friction.
     """
     return Space(
         tuple(
@@ -92,10 +91,23 @@ def sensor_parameter(
     slides: bool = False,
     **options: Any,
 ) -> Parameter:
-    """One of those parameters with a prior deviation and bounds of its own (low: -high unless given).
+    """One parameter of a joint's torque sensor, with mean zero.
 
-    slides: the joint does, so that its unit is N.  options: nuisance, group.
-    Raises ValueError for an unknown term or joint.
+    Args:
+        joints: measured joints.
+        term: one of `TERMS`.
+        joint: name of the joint.
+        std: prior deviation.
+        high: upper bound.
+        low: lower bound; None: -high.
+        slides: whether the joint is a slide, so that its torque is in N.
+        options: further fields of `Parameter` (nuisance, group).
+
+    Returns:
+        The parameter.
+
+    Raises:
+        ValueError: the term or the joint is unknown.
     """
     if term not in TERMS:
         raise ValueError(f"unknown sensor term {term!r}; valid: {', '.join(TERMS)}")

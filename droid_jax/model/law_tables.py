@@ -1,8 +1,8 @@
-"""Laws of effects as tables over the variable that they depend on, for programs that know nothing of this one.
+"""Tables of effects' laws over the variables on which they depend, for programs without this package.
 
-A law is evaluated as the replay evaluates it: its function is probed for what it depends on, and then tabulated.  So a
-law of a user's own file has a table too.  What depends on more than position, speed and load of one joint (a base that
-is not level, say) has none, and the reason is given.
+The law's function is that of the replay.  It is probed for the variables on which it depends, and then tabulated.  So
+user effects have tables too.  A law that depends on more than position, speed and load of one joint (such as that of a
+tilted base) has no table; the reason is given.
 """
 
 from __future__ import annotations
@@ -21,29 +21,37 @@ from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.scene import Scene
 from droid_jax.model.table_grid import ROUNDING, GridAxis, differences, first_nodes, on_grid, refined
 
-SPEED, TURNS, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: how far tables reach where no limit says it
-LOAD = 2000.0  # N m: likewise, where no force limit says it; nodes are closer about zero, so that far costs nothing
-USUAL_LOAD = 20.0  # N m: a torque that is rounded off about as a servo's feedback is
-RAISED = 64.0  # N m of friction beside a law, so that none of it is cut off at zero; float32 still sees 4e-6
-FEWEST = 2048  # states at once: a program is compiled for each count, so there are few of them
-PROBES, CHANGE = 12, 1e-6  # states at which a dependence is looked for; relative change that counts as one
-COARSEST = 0.1  # of a table's largest value, by which it may miss its law at the fitted values
-MOSTLY = 0.95  # of its cells, in which that counts: a law may jump in one
-NARROW = 1e-3  # of the probed range: as many states again lie closer and closer, for laws that act in little of it
+SPEED, ANGLE, TRAVEL = 20.0, 2 * np.pi, 2.0  # rad/s or m/s, rad, m: ranges of tables without a limit in the model
+LOAD = 2000.0  # N m, likewise without a force limit; nodes are denser about zero, so a wide range costs nothing
+LEAST_LOAD = 20.0  # N m, least torque relative to which float32 rounding of a servo's feedback is judged
+BASE_FRICTION = 64.0  # N m of friction to which a law is added, so that no part is clipped at zero (float32: 4e-6)
+SMALLEST_BATCH = 2048  # states of a batch; a program is compiled for each size, so there are few sizes
+PROBES, CHANGE = 12, 1e-6  # states at which a dependence is tested; relative change that counts as one
+LARGEST_ERROR = 0.1  # of a table at the fitted values, as a share of its largest value,
+ERROR_QUANTILE = 0.95  # in this share of random points, since a law may jump in a cell
+NARROW = 1e-3  # smallest share of the probed range for PROBES further states, for laws that act in a small part of it
 VARIABLES = ("position", "speed", "load")
 UNIT = {"position": ("rad", "m"), "speed": ("rad/s", "m/s"), "load": ("N m", "N"), "torque": ("N m", "N")}
 
 
 @dataclass(frozen=True, eq=False)
 class LawTable:
-    """A law on one joint: sum over terms of (parameter, or 1 where it is None) times its table.
+    """A law on one joint: the sum over terms of a parameter (or 1) times its table.
 
-    acts: "force" (added to qfrc_applied), "frictionloss" (added to the joint's), "servo" (added to the torque of the
-    position servo), "command" (delay of the command, s), "acceleration" or "speed" (one over the limit that the servo
-    sets to its own goal).  axes: shape parameters
-    first, then variables: "position", "speed", "load" or "torque" (the servo's without the law).  terms:
-    (parameter, table over the axes).  error, error_of_draws: largest difference to the law
-    between the nodes at the fitted values, and anywhere, `unit`.
+    Attributes:
+        effect: its name.
+        location: of the effect.
+        description: of the effect.
+        acts: "force" (added to qfrc_applied), "frictionloss" (added to the joint's), "servo" (added to the torque of
+            the position servo), "command" (delay of the command, s), "acceleration" or "speed" (one over the limit of
+            the servo's profile).
+        joint: on which it acts.
+        unit: of the law.
+        axes: shape parameters first, then variables: "position", "speed", "load" or "torque" (the servo's without the
+            law).
+        terms: (parameter or None for 1, table over the axes).
+        error: largest interpolation error at the fitted values, `unit`.
+        error_of_draws: largest interpolation error anywhere, `unit`.
     """
 
     effect: str
@@ -60,7 +68,7 @@ class LawTable:
 
 @dataclass(frozen=True)
 class NoTable:
-    """A law that has no table, and why."""
+    """A law without a table, and the reason."""
 
     effect: str
     location: str
@@ -71,14 +79,14 @@ class NoTable:
 def law_tables(
     scene: Scene, model: Any, effects: Sequence[Effect], values: dict[str, float], spread: dict[str, float]
 ) -> Iterator[LawTable | NoTable]:
-    """Tables of all laws that act in a simulation; sensor models and changed model fields have none.
+    """Yield the tables of all laws that act in a simulation, not of sensor models and changed model fields.
 
     Args:
         scene: of the fit.
         model: mjx.Model with the fitted numbers, for laws that read the servos' gains.
         effects: of the model.
         values: fitted values by parameter.
-        spread: deviation by parameter, of those that vary: tables hold shapes up to four of them away.
+        spread: standard deviations of the parameters that vary.  Tables cover shape parameters within four of them.
     """
     for effect in effects:
         for location, coefficients in (effect.locations or {"": tuple(p.name for p in effect.parameters)}).items():
@@ -86,10 +94,10 @@ def law_tables(
                 continue
             law = _Law(scene, model, effect, location, coefficients, values, spread)
             try:
-                made = list(_tables(law))
-            except Exception as error:  # of a user's law, which may do anything; the fit itself is whole
-                made = [law.without(f"no table could be made of it ({type(error).__name__}: {error})")]
-            yield from made
+                tables = list(_tables(law))
+            except Exception as error:  # a user's law may raise anything; the fit is still valid
+                tables = [law.no_table(f"no table could be made of it ({type(error).__name__}: {error})")]
+            yield from tables
 
 
 def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
@@ -119,28 +127,28 @@ class _Law:
 
     @property
     def parameters(self) -> list[str]:
-        """What of the fit it reads: its coefficients here, and its shapes."""
-        own = {p.name for p in self.effect.parameters if not p.writes}
+        """Fitted parameters that it reads: its coefficients at this location, and its shape parameters."""
+        of_effect = {p.name for p in self.effect.parameters if not p.writes}
         others = {n for at, names in self.effect.locations.items() if at != self.location for n in names}
-        return [n for n in self.values if n in own and (n in self.coefficients or n not in others)]
+        return [n for n in self.values if n in of_effect and (n in self.coefficients or n not in others)]
 
     def probe(self, name: str) -> float:
-        """A value at which the law is there: the fitted one, or what draws may have where that is zero."""
+        """A value at which the law acts: the fitted one, or its deviation if that is zero."""
         return self.values[name] or self.spread.get(name, 0.0)
 
-    def without(self, why: str) -> NoTable:
-        """No table."""
+    def no_table(self, why: str) -> NoTable:
+        """The law without a table."""
         return NoTable(self.effect.name, self.location, self.effect.description, why)
 
     def theta(self, given: dict[str, Any]) -> dict[str, Any]:
-        """What the law reads, other locations at neutral."""
+        """theta for given parameters, with neutral values at other locations."""
         return dict(complete({n: jnp.float32(given[n]) for n in self.parameters}, [self.effect]))
 
     def limit(self) -> LawTable | NoTable:
-        """One over the most that a servo lets its own goal speed up, or move, as the effect says of itself."""
+        """One over the limit of acceleration or speed of a servo's profile (`Effect.profile_limits`)."""
         effect, unit = self.effect, {p.name: p.unit for p in self.effect.parameters}
         if not effect.profile_limits or self.location not in self.scene.driven_joints or len(self.parameters) != 1:
-            return self.without("it draws a path of its own between two goals")
+            return self.no_table("it draws its own path between two goals")
         (name,) = self.parameters
         acts, terms = effect.profile_limits, ((name, np.array(1.0)),)
         return LawTable(
@@ -148,35 +156,34 @@ class _Law:
         )
 
     def delay(self) -> LawTable | NoTable:
-        """How late the command comes, s."""
+        """Delay of the command, s."""
         if self.effect.over_time:
-            return self.without("it goes by the time since the recording began")
+            return self.no_table("it depends on the time since the recording began")
         command = self.effect.command
         assert command is not None
 
         names, at = self.parameters, {n: self.values[n] for n in self.parameters}
-        none = "it does more to the command than to delay it"
-        if np.ndim(command(self.theta(at), jnp.float32(1.0), lambda t: t)):  # each actuator's by itself
-            return self.without(none)
+        reason = "it does more to the command than to delay it"
+        if np.ndim(command(self.theta(at), jnp.float32(1.0), lambda t: t)):  # different for each actuator
+            return self.no_table(reason)
 
-        def late(given: dict[str, float], power: int) -> float:
+        def response(given: dict[str, float], power: int) -> float:
+            """What the law makes of the command t^power at 1 s."""
             return float(command(self.theta(given), jnp.float32(1.0), lambda t: t**power))
 
-        found = [1.0 - late({**dict.fromkeys(names, 0.0), n: 1e-3}, 1) for n in names]
-        whole = 1.0 - late(at, 1)
-        shares = np.array(found) / 1e-3
-        straight = (
-            abs(float(shares @ [at[n] for n in names]) - whole) < 1e-5 and abs((1 - whole) ** 2 - late(at, 2)) < 1e-5
-        )
-        if not straight:
-            return self.without(none)
-        terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, shares, strict=True) if s)
+        delays = [1.0 - response({**dict.fromkeys(names, 0.0), n: 1e-3}, 1) for n in names]
+        total = 1.0 - response(at, 1)
+        slopes = np.array(delays) / 1e-3
+        is_delay = abs((1 - total) ** 2 - response(at, 2)) < 1e-5
+        if not (is_delay and abs(float(slopes @ [at[n] for n in names]) - total) < 1e-5):
+            return self.no_table(reason)
+        terms = tuple((n, np.array(float(f"{s:.3g}"))) for n, s in zip(names, slopes, strict=True) if s)
         return LawTable(
             self.effect.name, self.location, self.effect.description, "command", "", "s", (), terms, 0.0, 0.0
         )
 
     def of_state(self, acts: str) -> Iterator[LawTable | NoTable]:
-        """Force or friction, of each joint that it acts on."""
+        """Force or friction loss, for each joint on which it acts."""
         scene, nv = self.scene, self.scene.model.nv
         function = self._batched(acts)
         rng = np.random.default_rng(0)
@@ -186,10 +193,10 @@ class _Law:
         at = {n: np.full(len(scale), self.probe(n)) for n in self.parameters}
         now = function(at, base)
         if np.any(function(at, np.concatenate([base, rng.uniform(-0.5, 0.5, (len(scale), 2 * nv))], axis=1)) != now):
-            yield self.without("it depends on what motor and links put onto the gear")
+            yield self.no_table("it depends on the torques of motor and links on the gear")
             return
         if not np.abs(now).max() > 0:
-            yield self.without("it does not act near the scene's own pose, where its table would be made")
+            yield self.no_table("it does not act near the scene's reference pose, where its table would be made")
             return
         touched: dict[int, set[tuple[str, int]]] = {}
         for column, variable, row in self._columns():
@@ -201,7 +208,7 @@ class _Law:
         for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
             of = touched.get(int(dof), set())
             if len({row for _, row in of}) > 1 or len(of) > 2:
-                yield self.without("it depends on the state of several joints")
+                yield self.no_table("it depends on the state of several joints")
                 return
         for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
             of = touched.get(int(dof), set())
@@ -210,10 +217,10 @@ class _Law:
             yield self._table(acts, int(dof), row, names, function)
 
     def of_servo(self) -> LawTable | NoTable:
-        """What is added to a servo's torque, over that torque."""
+        """The torque that is added to a servo's, over the servo's torque."""
         joint = self.location
         if joint not in self.scene.driven_joints:
-            return self.without("it is no law of one joint's servo")
+            return self.no_table("it is no law of one joint's servo")
         u, model = self.scene.command_names.index(joint), self.model
         gear = float(np.asarray(model.actuator_gear)[u, 0])
         gain, bias = float(model.actuator_gainprm[u, 0]), np.asarray(model.actuator_biasprm)[u]
@@ -237,9 +244,9 @@ class _Law:
         half = reach * np.geomspace(1e-3, 1.0, 20)
         probes = np.concatenate([-half, [0.0], half])
         at = {n: np.full(len(probes), self.probe(n)) for n in self.parameters}
-        rounded = 1e-4 * np.maximum(np.abs(probes), min(reach, USUAL_LOAD))
-        if np.any(np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)) > rounded):
-            return self.without("it depends on more than the servo's torque")
+        rounding = 1e-4 * np.maximum(np.abs(probes), min(reach, LEAST_LOAD))
+        if np.any(np.abs(of_torque(at, probes) - of_torque(at, probes, 0.4, 1.0)) > rounding):
+            return self.no_table("it depends on more than the servo's torque")
         unit = UNIT["torque"][self.scene.slides(joint)]
         return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],
                           lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
@@ -265,7 +272,7 @@ class _Law:
     def _made(
         self, acts: str, joint: str, unit: str, axes: list[GridAxis], at: Callable[..., np.ndarray]
     ) -> LawTable | NoTable:
-        """Terms by linear coefficients; all other parameters are axes of the table."""
+        """The table: linear coefficients are terms, other parameters are axes."""
         names, values = self.parameters, self.values
         linear = [n for n in names if n in self.coefficients and self._linear(n, axes, at)]
         shapes = [n for n in names if n not in linear]
@@ -297,32 +304,34 @@ class _Law:
             *(replace(a, nodes=a.nodes[i : i + 1]) for a, i in zip(every, here, strict=False)),
             *every[len(here) :],
         ]
-        off = [differences(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
-        own, usual = (float(np.dot(sizes, [np.quantile(each, q) for each in off])) for q in (1.0, MOSTLY))
-        if usual > COARSEST * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
-            return self.without(f"a table of {len(every[-1].nodes)} nodes is too coarse for it")
+        errors = [differences(fixed, f, t[here].reshape([len(a.nodes) for a in fixed])) for (_, t), (_, f) in pairs]
+        largest, usual = (
+            float(np.dot(sizes, [np.quantile(each, q) for each in errors])) for q in (1.0, ERROR_QUANTILE)
+        )
+        if usual > LARGEST_ERROR * float(np.dot(sizes, [np.abs(t[here]).max() for _, t in tables])):
+            return self.no_table(f"a table of {len(every[-1].nodes)} nodes is too coarse for it")
         effect = self.effect
         return LawTable(
-            effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, own, worst
+            effect.name, self.location, effect.description, acts, joint, unit, tuple(every), tables, largest, worst
         )
 
     def _linear(self, name: str, axes: list[GridAxis], at: Callable[..., np.ndarray]) -> bool:
-        """Whether the law is this coefficient times something, beside the others' parts."""
+        """Whether the law is linear in this coefficient, and additive to the parts of the others."""
         x = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
         count = len(x)
         given = {n: np.full(count, self.values[n]) for n in self.parameters}
         zero = {n: (np.zeros(count) if n in self.coefficients else v) for n, v in given.items()}
         size = self.values[name] or 1.0
         none, one, two = (at({**zero, name: np.full(count, k * size)}, x) for k in (0.0, 1.0, 2.0))
-        rest = at({**given, name: np.zeros(count)}, x)
+        others = at({**given, name: np.zeros(count)}, x)
         slack = 1e-4 * max(np.abs(two).max(), 1e-12) + ROUNDING
-        parts = np.abs(at({**given, name: np.full(count, size)}, x) - rest - one).max()
-        return bool(np.abs(none).max() <= slack and np.abs(two - 2 * one).max() <= slack and parts <= slack)
+        interaction = np.abs(at({**given, name: np.full(count, size)}, x) - others - one).max()
+        return bool(np.abs(none).max() <= slack and np.abs(two - 2 * one).max() <= slack and interaction <= slack)
 
     def _batched(self, acts: str) -> Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]:
-        """(parameters [K] each, states [K, nq + nv + nv], with the gear's torques 2 nv more) -> [K, nv]."""
+        """(parameters [K] each, states [K, nq + 2 nv] or [K, nq + 4 nv] with the gears' torques) -> [K, nv]."""
         nq, nv, model = self.scene.model.nq, self.scene.model.nv, self.model
-        raised = jnp.full(nv, RAISED, jnp.float32)
+        base = jnp.full(nv, BASE_FRICTION, jnp.float32)
 
         def one(given: dict[str, Any], row: Any) -> Any:
             position, speed, load, gear = jnp.split(row, (nq, nq + nv, nq + 2 * nv))
@@ -332,7 +341,7 @@ class _Law:
                 assert self.effect.force is not None
                 return self.effect.force(theta, state)
             assert self.effect.frictionloss is not None
-            return self.effect.frictionloss(theta, state, raised) - raised
+            return self.effect.frictionloss(theta, state, base) - base
 
         batch, wide = _padded(one), nq + 4 * nv
 
@@ -342,7 +351,7 @@ class _Law:
         return of
 
     def _columns(self) -> Iterator[tuple[int, str, int]]:
-        """(column of a state, variable, degree of freedom), of joints of one degree."""
+        """(column of a state, variable, degree of freedom) for hinges and slides."""
         model = self.scene.model
         single = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)))
         for joint in np.flatnonzero(single):
@@ -350,7 +359,7 @@ class _Law:
             yield from zip((q, model.nq + v, model.nq + model.nv + v), VARIABLES, (v, v, v), strict=True)
 
     def _reach(self, joint: str, variable: str) -> tuple[float, float]:
-        """How far a table goes."""
+        """Range of a table's axis."""
         model, row = self.scene.model, self.scene.id("joint", joint)
         if variable == "load":
             return -self._load_reach(joint), self._load_reach(joint)
@@ -359,11 +368,11 @@ class _Law:
         low, high = model.jnt_range[row]
         if low < high:
             return float(low - 0.1 * (high - low)), float(high + 0.1 * (high - low))
-        far = TRAVEL if self.scene.slides(joint) else TURNS
-        return -far, far
+        reach = TRAVEL if self.scene.slides(joint) else ANGLE
+        return -reach, reach
 
     def _load_reach(self, joint: str) -> float:
-        """Of what the actuators of a joint can do, N m."""
+        """N m (N), largest load of a joint, from the limits of its actuators."""
         model = self.scene.model
         ends = [model.jnt_actfrcrange[self.scene.id("joint", joint)]]
         if joint in self.scene.driven_joints:
@@ -374,12 +383,12 @@ class _Law:
 
 
 def _padded(one: Callable[..., Any]) -> Callable[..., np.ndarray]:
-    """A function of (parameters, *numbers) for many of them, compiled for a few counts alone."""
+    """A function of (parameters, *numbers) for batches, compiled for a few batch sizes."""
     batch = jax.jit(jax.vmap(one))
 
     def many(given: dict[str, np.ndarray], *rows: np.ndarray) -> np.ndarray:
         count = len(rows[0])
-        size = FEWEST * 8 ** max(0, math.ceil(math.log(count / FEWEST, 8)))
+        size = SMALLEST_BATCH * 8 ** max(0, math.ceil(math.log(count / SMALLEST_BATCH, 8)))
 
         def filled(x: Any) -> jax.Array:
             return jnp.asarray(np.resize(x, (size, *np.shape(x)[1:])), jnp.float32)

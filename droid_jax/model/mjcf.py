@@ -1,4 +1,4 @@
-"""A fitted scene as MJCF: the numbers of its model written into the spec, in a file that MuJoCo reads."""
+"""Write a fitted scene as MJCF."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from droid_jax.model.mjcf_in_place import Change, Edited, NotInPlace, PlacedNumb
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import SOFT_IMPEDANCE, Scene
-from droid_jax.model.visual_geoms import compiled, keep_inertia, visual_geoms, weigh
+from droid_jax.model.visual_geoms import compiled, keep_inertia, state_inertia, visual_geoms
 
-# Model field -> attribute of the element that holds a row of it, or its first numbers.
+# Model field -> attribute of MuJoCo's spec that sets a row of it, or its first numbers.
 _ATTRIBUTES = {
     "dof_damping": "damping", "dof_frictionloss": "frictionloss", "dof_armature": "armature",
     "dof_solref": "solref_friction", "dof_solimp": "solimp_friction",
@@ -38,7 +38,7 @@ _ATTRIBUTES = {
     "actuator_gainprm": "gainprm", "actuator_biasprm": "biasprm", "actuator_gear": "gear",
     "actuator_ctrlrange": "ctrlrange", "actuator_forcerange": "forcerange",
 }  # fmt: skip
-# As MJCF spells attributes that MuJoCo's spec spells otherwise.
+# Attribute of MuJoCo's spec -> its name in MJCF, where they differ.
 _SPELLED = {"solref_friction": "solreffriction", "solimp_friction": "solimpfriction", "solref_limit": "solreflimit",
             "solimp_limit": "solimplimit", "actfrcrange": "actuatorfrcrange"}  # fmt: skip
 _INERTIAL = {
@@ -49,46 +49,46 @@ _INERTIAL = {
 }
 _COMPARED = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
 _GAIN, _DAMPING = ("actuator_gainprm", 0), ("actuator_biasprm", 2)  # of a servo: kp or a velocity servo's kv, and kv
-SLACK = 2e-6  # what TINY_FRICTIONLOSS may differ by
-_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # written as the body's own <inertial>
-_FOLLOWING = {"geom_rbound", "geom_aabb"}  # the compiler works them out
-_UNITS = {  # of fields by hinge and slide, where they are not the same
+SLACK = 2e-6  # absolute difference that TINY_FRICTIONLOSS may cause
+_WEIGHT = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}  # written as the body's <inertial>
+_FOLLOWING = {"geom_rbound", "geom_aabb"}  # derived by the compiler
+_UNITS = {  # of fields; of hinge and slide, if they differ
     "dof_damping": ("N m s/rad", "N s/m"), "dof_frictionloss": ("N m", "N"), "dof_armature": ("kg m^2", "kg"),
     "jnt_stiffness": ("N m/rad", "N/m"), "qpos_spring": ("rad", "m"), "qpos0": ("rad", "m"), "jnt_range": ("rad", "m"),
     "jnt_margin": ("rad", "m"), "jnt_actfrcrange": ("N m", "N"), "body_mass": "kg", "body_inertia": "kg m^2",
     "body_pos": "m", "body_ipos": "m", "geom_pos": "m", "geom_size": "m", "geom_margin": "m", "geom_gap": "m",
     "jnt_pos": "m", "pair_margin": "m", "pair_gap": "m",
 }  # fmt: skip
-WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING, PSEUDO_INERTIA})  # model fields that MJCF can say
+WORDS = frozenset({*_ATTRIBUTES, *_WEIGHT, *_FOLLOWING, PSEUDO_INERTIA})  # model fields that MJCF can express
 _ANGLES = {"jnt_range", "qpos_spring", "qpos0"}  # written in the compiler's unit
 _PLACE = {"body_pos", "body_quat"}  # written together
-# Compared with the model once more, a compiler may know more ways to work numbers out.
+# Fields that are compared with the model after compilation, since the compiler may derive other numbers.
 _SURE = (
     *("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature"),
     *("actuator_gainprm", "actuator_biasprm"),
 )
 _SHAPE = {"geom_pos", "geom_quat", "geom_size"}
-_OF_FILES = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # geoms whose shape is not the MJCF's
+_OF_FILES = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # geoms with a shape from a file
 
 
 def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect] = ()) -> str:
-    """The scene as one MJCF text with fitted values written in; `unwritten` says which have no place in it.
+    """The scene as one MJCF text with fitted values; `unwritten` lists parameters that MJCF cannot express.
 
-    It is MuJoCo's own way of writing the whole scene; `fitted_files` keeps the user's file. Files of meshes and
-    textures are named by their absolute paths, wherever the text is saved.
+    MuJoCo writes the text from its spec; `fitted_files` keeps the user's file. Paths of meshes and textures are
+    absolute, so that the text can be saved anywhere.
 
     Args:
-        scene: whose MJCF it is.
+        scene: of the fit.
         space: meaning of the values.
         values: [D] physical values.
-        effects: in the model; of those that are laws, what MuJoCo says in numbers of its own (`Effect.native`).
+        effects: in the model; those that MuJoCo's numbers can express are written too (`Effect.native`).
 
     Returns:
         The text of the MJCF.
 
     Raises:
-        ValueError: values of another shape, or MuJoCo compiles no model of them: a replay takes an inertia that no body
-            can have (fitted about one axis alone, say), the compiler does not.
+        ValueError: values have another shape, or MuJoCo cannot compile them. A replay accepts an inertia that no body
+            can have (such as a moment fitted about one axis), the compiler does not.
     """
     return _text(_fitted(scene, space, values, effects))
 
@@ -97,10 +97,12 @@ def fitted_mjcf(scene: Scene, space: Space, values: np.ndarray, effects: Sequenc
 class FittedFiles:
     """A fitted scene as MJCF files.
 
-    files: name -> text, all for one folder; the first one is to be loaded.  changes: the numbers that differ from the
-    scene's own.  in_place: whether these are the user's own files with only these numbers changed, and paths, which are
-    absolute.  patch: then the same changes to the user's files, as a unified diff to be applied beside the main one.
-    reason: why not in place, else empty.
+    Attributes:
+        files: name -> text, all for one folder; the first is the main file.
+        changes: the numbers that differ from the scene's.
+        in_place: whether these are the user's files, in which only these numbers and paths (absolute) are changed.
+        patch: if in place, the same changes to the user's files as a unified diff, relative to the main file.
+        reason: why it is not in place; else empty.
     """
 
     files: dict[str, str]
@@ -113,28 +115,38 @@ class FittedFiles:
 def fitted_files(
     scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect] = (), main: str = "fitted.xml"
 ) -> FittedFiles:
-    """The user's own MJCF with fitted values in the place of its numbers; layout, includes and comments stay.
+    """The user's MJCF with its numbers replaced by fitted values; layout, includes and comments are unchanged.
 
-    Where changed numbers alone do not make the fitted model (see `mjcf_in_place`), or the scene was never a file, it is
-    the text of `fitted_mjcf`.  Arguments and errors are those of `fitted_mjcf`; main: name of the file to load.
+    If replacing numbers does not give the fitted model (see `mjcf_in_place`), or the scene has no file, it is the text
+    of `fitted_mjcf`.  Arguments and errors are those of `fitted_mjcf`.
+
+    main: name of the main file.
     """
     fitted = _fitted(scene, space, values, effects)
     try:
         if scene.path is None:
             raise NotInPlace("the scene was put together in memory")
-        made = edit(scene.path, fitted.before, fitted.wanted, fitted.weighed, main)
-        _check_files(made.files, main, fitted.written)
+        edited = edit(scene.path, fitted.before, fitted.wanted, fitted.new_inertia, main)
+        _check_files(edited.files, main, fitted.written)
     except (ValueError, OSError) as error:
         reason = " ".join(str(error).split())
         return FittedFiles({main: _text(fitted)}, tuple(_changes(fitted, None)), False, reason=reason)
-    return FittedFiles(made.files, tuple(_changes(fitted, made)), True, made.patch)
+    return FittedFiles(edited.files, tuple(_changes(fitted, edited)), True, edited.patch)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """spec: with the values written in, `before` the scene's own, numbered.  written: what the spec compiles to.
-    model: that was wished for.  wanted: numbers that differ.  weighed: bodies that weigh otherwise, with the whole
-    model."""
+    """A scene with fitted values in all its forms.
+
+    Attributes:
+        scene: of the fit.
+        spec: with the fitted values.
+        before: the scene's spec, compiled so that its elements are numbered.
+        written: the model compiled from `spec`.
+        model: the scene's model with the values.
+        wanted: numbers that differ.
+        new_inertia: body with another inertia -> `model`.
+    """
 
     scene: Scene
     spec: mujoco.MjSpec
@@ -142,7 +154,7 @@ class _Fitted:
     written: mujoco.MjModel
     model: mujoco.MjModel
     wanted: tuple[WantedNumber, ...]
-    weighed: dict[int, mujoco.MjModel]
+    new_inertia: dict[int, mujoco.MjModel]
 
 
 def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Effect]) -> _Fitted:
@@ -156,16 +168,16 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
     for effect in effects:
         for (field, row), more in (native(effect, space, values, model) or {}).items():
             getattr(model, field)[row] += more
-    compiled(spec)  # numbers its elements, of which not all need a name
+    compiled(spec)  # numbers its elements
     compiled(before)
     changed: list[tuple[str, Any, int, str]] = []
     by_kind = _elements(spec, model)
     for kind, elements in by_kind.items():
         for row, element in elements.items():
             changed += [(kind, element, row, f) for f in _write_changed(kind, element, row, scene.model, model)]
-    changed += [("actuator", a, a.id, "actuator_biasprm") for a in _settle(spec, model)]
+    changed += [("actuator", a, a.id, "actuator_biasprm") for a in _state_derived(spec, model)]
     changed += [("dof", e, row, "dof_solimp") for row, e in by_kind["dof"].items() if e.name in scene.held]
-    for joint in before.joints:  # friction that holds here creeps in the user's file
+    for joint in before.joints:  # the user's file has the soft default
         if joint.name in scene.held:
             joint.solimp_friction = list(SOFT_IMPEDANCE)
     keep_inertia(spec, model)
@@ -175,13 +187,13 @@ def _fitted(scene: Scene, space: Space, values: np.ndarray, effects: Sequence[Ef
         raise ValueError(f"the fitted values make no MJCF: {' '.join(str(error).split())}") from None
     other = [f for f in _SURE if not np.allclose(getattr(written, f), getattr(model, f), rtol=1e-3, atol=1e-5)]
     if other:
-        raise ValueError(f"the fitted values make no MJCF: MuJoCo works out another {', '.join(other)} from it")
+        raise ValueError(f"the fitted values make no MJCF: MuJoCo derives another {', '.join(other)} from it")
     old = _elements(before, model)
     wanted = tuple(_wanted(scene.model, model, kind, old[kind][row], e, row, f) for kind, e, row, f in changed)
-    heavier = np.any([_differ(getattr(scene.model, f), getattr(model, f)) for f in sorted(_WEIGHT)], axis=0)
-    weighed = {int(b): model for b in np.flatnonzero(heavier & (model.body_mass > 0))}
+    differs = np.any([_differ(getattr(scene.model, f), getattr(model, f)) for f in sorted(_WEIGHT)], axis=0)
+    new_inertia = {int(b): model for b in np.flatnonzero(differs & (model.body_mass > 0))}
     unique = {(w.element, w.row, w.field): w for w in wanted}
-    return _Fitted(scene, spec, before, written, model, tuple(unique.values()), weighed)
+    return _Fitted(scene, spec, before, written, model, tuple(unique.values()), new_inertia)
 
 
 def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -193,29 +205,29 @@ def _wanted(
     before: mujoco.MjModel, after: mujoco.MjModel, kind: str, old: Any, new: Any, row: int, field: str
 ) -> WantedNumber:
     attribute = _ATTRIBUTES[field]
-    if field in _SHAPE | _PLACE:  # a spec may say them in other words
+    if field in _SHAPE | _PLACE:  # a spec may state them by other attributes
         numbers = getattr(before, field)[row], getattr(after, field)[row]
     else:
         numbers = getattr(old, attribute), getattr(new, attribute)
-    of = np.atleast_1d(np.array(numbers[0], float)), np.atleast_1d(np.array(numbers[1], float))
+    pair = np.atleast_1d(np.array(numbers[0], float)), np.atleast_1d(np.array(numbers[1], float))
     element = "joint" if kind in ("dof", "jnt", "qpos") else kind
-    return WantedNumber(element, new.id, _SPELLED.get(attribute, attribute), *of, field)
+    return WantedNumber(element, new.id, _SPELLED.get(attribute, attribute), *pair, field)
 
 
-def _changes(fitted: _Fitted, made: Edited | None) -> Iterator[Change]:
-    """The numbers that differ, by element and entry; made: the user's files with them, None where there are none."""
-    model, own = fitted.model, fitted.scene.model
+def _changes(fitted: _Fitted, edited: Edited | None) -> Iterator[Change]:
+    """Yield the numbers that differ, by element and entry; edited: the user's files with them, if there are any."""
+    model, nominal = fitted.model, fitted.scene.model
     by_kind = {kind: rows.items() for kind, rows in _elements(fitted.before, model).items()}
     for i, want in enumerate(fitted.wanted):
-        placed = PlacedNumber(want.attribute) if made is None else made.placed[i]
+        placed = PlacedNumber(want.attribute) if edited is None else edited.placed[i]
         row, named = next((r, e.name) for r, e in by_kind[_kind(want.field)] if e.id == want.row)
         width = np.asarray(getattr(model, want.field)).shape[1:]
-        short = placed.attribute in ("kp", "kv")  # one number, which is several of the model's
+        short = placed.attribute in ("kp", "kv")  # one number that sets several of the model's
         differing = np.flatnonzero(want.before != want.after) if placed.attribute else ()
         for k in [k for k in differing if not short or (want.field, k) in (_GAIN, _DAMPING)]:
             entry, before = ((row, int(k)) if width else (row,)), want.before[k]
-            if want.element == "actuator":  # a spec may have a ratio in place of the number that it compiles to
-                before = getattr(own, want.field)[entry]
+            if want.element == "actuator":  # a spec may have a ratio from which the number is compiled
+                before = getattr(nominal, want.field)[entry]
             sign = -1.0 if short and want.field == _DAMPING[0] else 1.0
             numbers = sign * float(before), sign * float(want.after[k])
             if numbers[0] == numbers[1]:
@@ -223,10 +235,10 @@ def _changes(fitted: _Fitted, made: Edited | None) -> Iterator[Change]:
             where = placed.file, placed.line, placed.origin
             index = 0 if short else int(k)
             yield Change(want.element, named, placed.attribute, index, want.field, entry, *numbers, *where)
-    for body in fitted.weighed:
-        where = ("", 0) if made is None else made.bodies[body]
+    for body in fitted.new_inertia:
+        where = ("", 0) if edited is None else edited.bodies[body]
         for field in sorted(_WEIGHT):
-            old, new = (np.atleast_1d(getattr(m, field)[body]) for m in (own, model))
+            old, new = (np.atleast_1d(getattr(m, field)[body]) for m in (nominal, model))
             for k in np.flatnonzero(~np.isclose(old, new, rtol=1e-9, atol=1e-14)):
                 entry = (body, int(k)) if np.ndim(getattr(model, field)[body]) else (body,)
                 numbers = float(old[k]), float(new[k])
@@ -234,24 +246,24 @@ def _changes(fitted: _Fitted, made: Edited | None) -> Iterator[Change]:
 
 
 def _kind(field: str) -> str:
-    """The beginning of a field's name: "dof" of "dof_damping", "qpos" of "qpos0"."""
+    """The prefix of a field's name: "dof" of "dof_damping", "qpos" of "qpos0"."""
     return field.split("_")[0].rstrip("0")
 
 
 def _check_files(files: Mapping[str, str], main: str, expected: mujoco.MjModel) -> None:
-    """NotInPlace unless the files compile to the same numbers."""
+    """Raise NotInPlace unless the files compile to the same numbers."""
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             (Path(folder) / name).parent.mkdir(exist_ok=True)
             (Path(folder) / name).write_text(text, encoding="utf-8")
-        made = compiled(mujoco.MjSpec.from_file(str(Path(folder) / main)))
+        model = compiled(mujoco.MjSpec.from_file(str(Path(folder) / main)))
     for name in dir(expected):
         if not name.startswith(_COMPARED):
             continue
-        one, two = np.asarray(getattr(made, name)), np.asarray(getattr(expected, name))
-        if two.dtype.kind != "f" or not two.ndim:
+        got, wanted = np.asarray(getattr(model, name)), np.asarray(getattr(expected, name))
+        if wanted.dtype.kind != "f" or not wanted.ndim:
             continue
-        if one.shape != two.shape or not np.allclose(one, two, rtol=1e-5, atol=SLACK):
+        if got.shape != wanted.shape or not np.allclose(got, wanted, rtol=1e-5, atol=SLACK):
             raise NotInPlace(f"with its numbers changed the file makes another {name}")
 
 
@@ -260,8 +272,8 @@ def _text(fitted: _Fitted) -> str:
     return unwrapped(fitted.spec.to_xml())
 
 
-def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
-    """Say in numbers, as the model has them, what the compiler would derive from fitted masses.
+def _state_derived(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
+    """State the model's numbers in a spec that would derive others from the fitted masses.
 
     Returns the actuators whose damping was a ratio and now is a number.
     """
@@ -269,7 +281,7 @@ def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
     if max(spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass) > 0:
         for body in spec.bodies[1:]:
             if model.body_mass[body.id] > 0:
-                weigh(body, model, body.id)
+                state_inertia(body, model, body.id)
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     for joint in spec.joints:
         if np.all(np.asarray(joint.springdamper) > 0):
@@ -277,7 +289,7 @@ def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
             _set(joint, "stiffness", model.jnt_stiffness[joint.id : joint.id + 1])
             _set(joint, "damping", model.dof_damping[model.jnt_dofadr[joint.id] :][:1])
     for tendon in spec.tendons:
-        if model.tendon_stiffness[tendon.id] > 0:  # else its length at qpos0, which a moved body changes
+        if model.tendon_stiffness[tendon.id] > 0:  # by default the length at qpos0, which a moved body changes
             tendon.springlength = model.tendon_lengthspring[tendon.id].tolist()
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:  # a servo's dampratio
@@ -289,26 +301,28 @@ def _settle(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[Any]:
 def native(
     effect: Effect, space: Space, values: np.ndarray, model: mujoco.MjModel
 ) -> Mapping[tuple[str, int], float] | None:
-    """What an effect adds to the numbers (field, row) of a model; None where it acts in the replay alone."""
+    """Increments of an effect to the numbers (field, row) of a model; None if only a replay can express it."""
     if effect.native is None:
         return None
-    neutral = {p.name: p.mean for p in effect.parameters}  # of what the space does not hold
+    neutral = {p.name: p.mean for p in effect.parameters}  # for parameters that the space lacks
     return effect.native(neutral | dict(zip(space.names, np.asarray(values).tolist(), strict=True)), model)
 
 
 def unwritten(scene: Scene, space: Space) -> tuple[str, ...]:
-    """Names of the parameters that MJCF has no words for: what lives outside the model (offsets, laws of effects),
-    fields without an attribute, and the shape of a mesh."""
-    return tuple(p.name for p in space.parameters if not p.writes or not _has_words(scene, p))
+    """Names of the parameters that MJCF cannot express.
+
+    These are parameters outside the model (offsets, laws of effects), fields without an attribute, and mesh shapes.
+    """
+    return tuple(p.name for p in space.parameters if not p.writes or not _expressible(scene, p))
 
 
-def _has_words(scene: Scene, parameter: Parameter) -> bool:
+def _expressible(scene: Scene, parameter: Parameter) -> bool:
     shaped = any(w.field in _SHAPE and scene.model.geom_type[w.index[0]] in _OF_FILES for w in parameter.writes)
     return all(w.field in WORDS for w in parameter.writes) and not shaped
 
 
 def mjcf_attribute(field: str) -> tuple[str, str]:
-    """Attribute of MuJoCo's spec and of MJCF that says a model field; empty where none does."""
+    """Attributes of MuJoCo's spec and of MJCF that set a model field; empty if there is none."""
     if field in _WEIGHT:
         return "", _INERTIAL[field]
     of_spec = _ATTRIBUTES.get(field, "")
@@ -316,20 +330,20 @@ def mjcf_attribute(field: str) -> tuple[str, str]:
 
 
 def field_unit(field: str, slides: bool) -> str:
-    """Unit of a model field's numbers, of a joint that turns or slides; empty for one that has none, or no single."""
+    """Unit of a model field's numbers, for a slide or a hinge; empty if there is none, or more than one."""
     unit = _UNITS.get(field, "")
     return unit if isinstance(unit, str) else unit[slides]
 
 
 def is_angle(field: str) -> bool:
-    """Whether MJCF has a field of hinges in degrees where its compiler says so."""
+    """Whether MJCF states the field in the angle unit of its compiler for hinges."""
     return field in _ANGLES
 
 
 def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int, Any]]:
-    """For each beginning of a field's name, the elements by their row in the scene's model, which has no looks."""
-    looks = {g.id for g in visual_geoms(spec)}
-    geoms = sorted((g for g in spec.geoms if g.id not in looks), key=lambda g: g.id)
+    """Prefix of a field's name -> row in the scene's model (without visual geoms) -> element of the spec."""
+    visual = {g.id for g in visual_geoms(spec)}
+    geoms = sorted((g for g in spec.geoms if g.id not in visual), key=lambda g: g.id)
     return {
         "dof": {int(model.jnt_dofadr[j.id]): j for j in spec.joints},
         "jnt": {j.id: j for j in spec.joints},
@@ -342,17 +356,17 @@ def _elements(spec: mujoco.MjSpec, model: mujoco.MjModel) -> dict[str, dict[int,
 
 
 def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, after: mujoco.MjModel) -> Sequence[str]:
-    """Write into an element what differs between its rows in two models; returns these fields."""
+    """Write the numbers of an element that differ between two models; returns their fields."""
     fields = [f for f in _ATTRIBUTES if f.startswith((f"{kind}_", f"{kind}0"))]
     changed = {f for f in fields if np.any(getattr(before, f)[row] != getattr(after, f)[row])}
-    if kind == "geom" and before.geom_type[row] in _OF_FILES:  # compiled numbers hold the file's own frame
+    if kind == "geom" and before.geom_type[row] in _OF_FILES:  # compiled numbers contain the file's frame
         changed -= _SHAPE
     differing = sorted(changed)
     for together in (_PLACE, _SHAPE):
         if changed & together:
             changed |= together
             _unplace(element)
-    if kind == "actuator" and element.inheritrange:  # from its joint, whose range may be another now
+    if kind == "actuator" and element.inheritrange:  # from its joint, whose range may have changed
         element.inheritrange = 0
         changed.add("actuator_ctrlrange")
     for field in changed:
@@ -364,7 +378,7 @@ def _write_changed(kind: str, element: Any, row: int, before: mujoco.MjModel, af
 
 
 def _unplace(element: Any) -> None:
-    """Take a body or geom out of its frame, and forget every other way in which its place was said."""
+    """Remove a body or geom from its frame, and remove all attributes of its pose other than pos and quat."""
     if element.frame is not None:
         element.set_frame(element.parent.add_frame())
     element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
@@ -373,7 +387,7 @@ def _unplace(element: Any) -> None:
 
 
 def _set(element: Any, attribute: str, numbers: np.ndarray) -> None:
-    """Set an attribute's number, or its first ones (of a damping that is a polynomial in the speed, say)."""
+    """Set an attribute's number, or its first numbers (such as a damping's, whose others are a polynomial)."""
     old = np.array(getattr(element, attribute), dtype=float)
     if old.ndim == 0:
         setattr(element, attribute, float(numbers[0]))
@@ -383,7 +397,7 @@ def _set(element: Any, attribute: str, numbers: np.ndarray) -> None:
 
 
 def _locate_assets(spec: mujoco.MjSpec) -> None:
-    """Have the folders of meshes and textures be found from anywhere."""
+    """Make the folders of meshes and textures absolute."""
     files = [a.file for kind in (spec.meshes, spec.textures, spec.hfields, spec.skins) for a in kind]
     if spec.modelfiledir and any(files):
         folder = Path(spec.modelfiledir)
@@ -392,13 +406,13 @@ def _locate_assets(spec: mujoco.MjSpec) -> None:
 
 
 def unwrapped(xml: str) -> str:
-    """MJCF without nameless defaults inside the defaults, which attached files leave and MuJoCo does not read.
+    """MJCF without unnamed defaults inside the defaults, which attached files cause and MuJoCo does not read.
 
-    Their classes move up; of classes that several files define alike, one stays.
+    Their classes move up by one level.  Equal classes of several files become one.
     """
     root = ElementTree.fromstring(xml)
     for defaults in root.findall("default"):
         lifted = [c for e in defaults for c in (e if e.tag == "default" and not e.get("class") else [e])]
-        alike = {ElementTree.canonicalize(ElementTree.tostring(c, "unicode"), strip_text=True): c for c in lifted}
-        defaults[:] = alike.values()
+        unique = {ElementTree.canonicalize(ElementTree.tostring(c, "unicode"), strip_text=True): c for c in lifted}
+        defaults[:] = unique.values()
     return ElementTree.tostring(root, encoding="unicode") + "\n"

@@ -1,8 +1,8 @@
-"""A fitted model in the user's own MJCF: the numbers that differ are changed where they stand, and nothing else.
+"""Write a fitted model into the user's MJCF by replacing the numbers that differ, and nothing else.
 
-Elements are found by their order in the file, which MuJoCo compiles them in, and their names.  What a change of numbers
-alone cannot say raises `NotInPlace`: elements that a tag makes several of (replicate, composite), places inside a
-frame, kinds of actuators that are short for more.  Whoever calls compiles the result and compares.
+Elements are found by their order in the file, in which MuJoCo compiles them, and by their names.  `NotInPlace` is
+raised if replacing numbers cannot express a change: for elements that one tag makes several of (replicate, composite),
+poses inside a frame, and actuator shortcuts without the attribute.  The caller compiles and compares the result.
 """
 
 from __future__ import annotations
@@ -20,22 +20,27 @@ from droid_jax.model.xml_text import Tag, Tree, read_tree, with_edits
 
 MAKES_SEVERAL = ("replicate", "composite", "flexcomp", "attach")
 TURNS = ("euler", "axisangle", "xyaxes", "zaxis")
-# Attributes with as many numbers as they always have; of others those up to the last one that changed are written.
+# Attributes with a fixed count of numbers; of others, numbers up to the last changed one are written.
 FIXED = ("range", "pos", "quat", "axis", "actuatorfrcrange", "ctrlrange", "forcerange")
-TINY = 1e-9  # relative: numbers that are closer are the one that stands there
+TINY = 1e-9  # relative difference up to which the text of a number is not replaced
 
 
 class NotInPlace(ValueError):
-    """Changed numbers alone do not make the fitted model of the user's file; the message says why."""
+    """Replacing numbers in the user's file does not give the fitted model; the message says why."""
 
 
 @dataclass(frozen=True)
 class Change:
     """A number that a fit changed.
 
-    element, name: "joint", "elbow".  attribute, index: of the MJCF.  field, entry: of the MuJoCo model.  before, after:
-    as the MJCF has them (degrees where it says so).  file, line: where the tag stands, empty and 0 where the scene is
-    no file.  origin: what the number came from, "" for the element itself, else its default class or MuJoCo's own.
+    Attributes:
+        element: kind of the element, such as "joint".
+        name: of the element.
+        attribute, index: in the MJCF.
+        field, entry: in the MuJoCo model.
+        before, after: in the MJCF's unit (degrees if it uses them).
+        file, line: of the tag; "" and 0 if the scene has no file.
+        origin: of the old number; "" for the element, else its default class or MuJoCo's default.
     """
 
     element: str
@@ -53,9 +58,14 @@ class Change:
 
 @dataclass(frozen=True)
 class WantedNumber:
-    """New numbers of an attribute of an element, the `row`-th of its kind in the compiled model.
+    """New numbers of an attribute of an element.
 
-    before, after: [n] all its numbers.  field: of the MuJoCo model.
+    Attributes:
+        element: kind of the element.
+        row: index of the element among its kind in the compiled model.
+        attribute: in the MJCF.
+        before, after: [n] all numbers of the attribute.
+        field: in the MuJoCo model.
     """
 
     element: str
@@ -68,8 +78,7 @@ class WantedNumber:
 
 @dataclass(frozen=True)
 class PlacedNumber:
-    """Where a number stands: the attribute that says it, "" where another one does; file, line and origin as in
-    `Change`."""
+    """Where a number is written: attribute ("" if another one implies it); file, line and origin as in `Change`."""
 
     attribute: str
     file: str = ""
@@ -79,9 +88,14 @@ class PlacedNumber:
 
 @dataclass(frozen=True, eq=False)
 class Edited:
-    """files: name -> text, to lie in one folder, the main one first: paths in them are absolute.  patch: the same
-    changes to the user's own files, as a unified diff.  placed: of each `WantedNumber`.  bodies: file and line of each
-    that was weighed."""
+    """The result of `edit`.
+
+    Attributes:
+        files: name -> text, for one folder, the main file first; paths in them are absolute.
+        patch: the same changes to the user's files, as a unified diff.
+        placed: for each `WantedNumber`.
+        bodies: body with a new inertia -> file and line.
+    """
 
     files: dict[str, str]
     patch: str
@@ -90,53 +104,60 @@ class Edited:
 
 
 def edit(
-    path: Path, spec: mujoco.MjSpec, wanted: Sequence[WantedNumber], weighed: Mapping[int, mujoco.MjModel], main: str
+    path: Path,
+    spec: mujoco.MjSpec,
+    wanted: Sequence[WantedNumber],
+    new_inertia: Mapping[int, mujoco.MjModel],
+    main: str,
 ) -> Edited:
-    """The user's file with numbers changed.
+    """The user's files with numbers replaced.
 
     Args:
         path: of the main file.
-        main: what it is called in the result; changed files that it includes go to a folder "STEM_parts" beside it.
-        spec: of it, compiled, so that its elements are numbered.
+        spec: of that file, compiled so that its elements are numbered.
         wanted: the numbers.
-        weighed: body -> model, of which it shall have mass, centre and inertia.
+        new_inertia: body -> model with its new mass, centre of mass and inertia.
+        main: name of the main file in the result; changed included files go to a folder "STEM_parts" beside it.
+
+    Returns:
+        The files.
 
     Raises:
-        NotInPlace: they cannot be written as changed numbers.
-        ValueError: a file is gone, or no longer what the spec was made of.
+        NotInPlace: replacing numbers cannot express the changes.
+        ValueError: a file is missing, or was changed since the spec was read.
     """
     tree = read_tree(path)
     if tree.root.name != "mujoco":
         raise NotInPlace(f"{path.name} is a <{tree.root.name}>, not an MJCF")
-    places = _elements(tree, spec)
+    tags = _elements(tree, spec)
     edits: dict[Tag, dict[str, str | None]] = {}
     inserted: dict[Tag, str] = {}
     placed: list[PlacedNumber] = []
     for want in wanted:
-        tag = places[want.element][want.row]
-        said = _attribute(tag, want)
-        name = next((k for k, v in said.items() if v is not None), "")
+        tag = tags[want.element][want.row]
+        attributes = _attribute(tag, want)
+        name = next((k for k, v in attributes.items() if v is not None), "")
         origin = "" if not name or name in tag.attributes else _origin(tree, tag, name)
         placed.append(PlacedNumber(name, tag.file.name, tag.line, origin))
-        edits.setdefault(tag, {}).update(said)
-    for body, model in weighed.items():
-        _weigh(places["body"][body], body, model, edits, inserted)
-    bodies = {body: (places["body"][body].file.name, places["body"][body].line) for body in weighed}
+        edits.setdefault(tag, {}).update(attributes)
+    for body, model in new_inertia.items():
+        _write_inertia(tags["body"][body], body, model, edits, inserted)
+    bodies = {body: (tags["body"][body].file.name, tags["body"][body].line) for body in new_inertia}
     changed = with_edits(tree, edits, inserted)
     names = _names(tree, main)
     paths = _absolute(tree, spec, changed, names)
     merged = {tag: {**edits.get(tag, {}), **paths.get(tag, {})} for tag in {**edits, **paths}}
-    standing = with_edits(tree, merged, inserted)
-    texts = {tree.root.file: tree.texts[tree.root.file].decode("utf-8"), **standing}
+    with_paths = with_edits(tree, merged, inserted)
+    texts = {tree.root.file: tree.texts[tree.root.file].decode("utf-8"), **with_paths}
     files = {names[file]: text for file, text in texts.items()}
     return Edited(files, _patch(tree, changed), tuple(placed), bodies)
 
 
 def _elements(tree: Tree, spec: mujoco.MjSpec) -> dict[str, list[Tag]]:
-    """The tags of each kind in the order of the compiled model; NotInPlace where they are not the spec's."""
+    """The tags of each kind in the order of the compiled model; NotInPlace if they do not agree with the spec."""
     several = next((tag for tag in tree.root.walk() if tag.name in MAKES_SEVERAL), None)
     if several is not None:
-        raise NotInPlace(f"{several.file.name}, line {several.line}: <{several.name}> makes elements of its own")
+        raise NotInPlace(f"{several.file.name}, line {several.line}: <{several.name}> makes further elements")
     sections = {
         name: [t for t in tree.root.children if t.name == name] for name in ("worldbody", "actuator", "contact")
     }
@@ -179,7 +200,7 @@ def _pair_key(name: str, one: str | None, two: str | None) -> tuple[str, ...]:
 
 
 def _bodies(tag: Tag) -> Iterator[Tag]:
-    """Bodies below a tag, each before those in it, as MuJoCo numbers them."""
+    """Yield the bodies below a tag in MuJoCo's order, each before its children."""
     for child in tag.children:
         if child.name == "body":
             yield child
@@ -188,7 +209,7 @@ def _bodies(tag: Tag) -> Iterator[Tag]:
 
 
 def _own(tag: Tag, names: tuple[str, ...]) -> Iterator[Tag]:
-    """Elements of a body itself, those in its frames included."""
+    """Yield the elements of a body, including those in its frames."""
     for child in tag.children:
         if child.name in names:
             yield child
@@ -197,7 +218,7 @@ def _own(tag: Tag, names: tuple[str, ...]) -> Iterator[Tag]:
 
 
 def _origin(tree: Tree, tag: Tag, attribute: str) -> str:
-    """Where a number that the element does not state comes from, in words."""
+    """The default that sets a number which the element does not state, for messages."""
     classes = {t.attributes.get("class", "main"): t for t in tree.root.walk() if t.name == "default"}
     given = tag.attributes.get("class") or next(
         (
@@ -218,15 +239,15 @@ def _origin(tree: Tree, tag: Tag, attribute: str) -> str:
 
 
 def _attribute(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
-    """Attributes of a tag that say the new numbers."""
+    """Attributes of a tag with the new numbers; None removes an attribute."""
     name, before, after = want.attribute, want.before, want.after
     if name in ("gainprm", "biasprm") and tag.name != "general":
         return _servo(tag, want)
     if want.element in ("body", "geom") and name in ("pos", "quat", "size"):
         if name != "size" and (tag.parent is not None and tag.parent.name == "frame"):
-            raise NotInPlace(f"{tag.file.name}, line {tag.line}: the place of a {tag.name} inside a frame")
+            raise NotInPlace(f"{tag.file.name}, line {tag.line}: the pose of a {tag.name} inside a frame")
         if "fromto" in tag.attributes and (name != "size" or np.any(before[1:] != after[1:])):
-            raise NotInPlace(f"{tag.file.name}, line {tag.line}: a geom that is given by its ends")
+            raise NotInPlace(f"{tag.file.name}, line {tag.line}: a geom that is given by fromto")
     out: dict[str, str | None] = {}
     if name == "quat":
         out = {turn: None for turn in TURNS if turn in tag.attributes}
@@ -238,13 +259,13 @@ def _attribute(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
 
 
 def _servo(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
-    """Gains of an actuator that is short for a general one: kp, kv."""
+    """Attributes kp and kv of an actuator shortcut (<position>, <velocity>)."""
     after, field = want.after, want.attribute
     if tag.name == "position" and field == "gainprm" and not after[1:].any():
         return {"kp": _token(after[0], tag.attributes.get("kp"))}
     if tag.name == "position" and field == "biasprm" and not after[0] and not after[3:].any():
         if want.before[2] == after[2]:
-            return {}  # -kp, which the gain says
+            return {}  # -kp, which kp implies
         return {"kv": _token(-after[2], tag.attributes.get("kv")), "dampratio": None}
     if tag.name == "velocity" and field == "gainprm" and not after[1:].any():
         return {"kv": _token(after[0], tag.attributes.get("kv"))}
@@ -254,7 +275,7 @@ def _servo(tag: Tag, want: WantedNumber) -> dict[str, str | None]:
 
 
 def _token(number: float, old: str | None) -> str:
-    """A number as text, the one that stands there where it is the same."""
+    """A number as text; the old text if it is the same number."""
     try:
         if old is not None and abs(float(old) - number) <= TINY * abs(number):
             return old
@@ -263,55 +284,58 @@ def _token(number: float, old: str | None) -> str:
     return f"{number:.8g}"
 
 
-def _weigh(
+def _write_inertia(
     tag: Tag, body: int, model: mujoco.MjModel, edits: dict[Tag, dict[str, str | None]], inserted: dict[Tag, str]
 ) -> None:
-    """Have a body say mass, centre and inertia of a model."""
+    """Add the edits that state a body's mass, centre of mass and inertia of a model."""
     mass, centre = float(model.body_mass[body]), model.body_ipos[body]
-    inertia, turned = model.body_inertia[body], model.body_iquat[body]
+    inertia, orientation = model.body_inertia[body], model.body_iquat[body]
 
     def numbers(values: np.ndarray) -> str:
         return " ".join(f"{v:.8g}" for v in values)
 
-    own = next((c for c in tag.children if c.name == "inertial"), None)
-    if own is None:
+    inertial = next((c for c in tag.children if c.name == "inertial"), None)
+    if inertial is None:
         if tag.empty:
-            raise NotInPlace(f"{tag.file.name}, line {tag.line}: a body without anything in it")
+            raise NotInPlace(f"{tag.file.name}, line {tag.line}: an empty body")
         inserted[tag] = (
-            f'<inertial pos="{numbers(centre)}" quat="{numbers(turned)}" mass="{mass:.8g}" '
+            f'<inertial pos="{numbers(centre)}" quat="{numbers(orientation)}" mass="{mass:.8g}" '
             f'diaginertia="{numbers(inertia)}"/>'
         )
         return
-    out: dict[str, str | None] = {"mass": _token(mass, own.attributes.get("mass"))}
-    tokens = own.attributes.get("pos", "").split() or ["0", "0", "0"]
+    out: dict[str, str | None] = {"mass": _token(mass, inertial.attributes.get("mass"))}
+    tokens = inertial.attributes.get("pos", "").split() or ["0", "0", "0"]
     out["pos"] = " ".join(_token(v, t) for v, t in zip(centre, tokens, strict=True))
-    said = {k: np.array(v.split(), float) for k, v in own.attributes.items() if k in ("diaginertia", "fullinertia")}
-    share = _scaled(own, inertia, said)
-    if share is not None:
-        kind, numbers_now = share
-        out[kind] = numbers(numbers_now)
+    stated = {
+        k: np.array(v.split(), float) for k, v in inertial.attributes.items() if k in ("diaginertia", "fullinertia")
+    }
+    scaled = _scaled(inertia, stated)
+    if scaled is not None:
+        attribute, values = scaled
+        out[attribute] = numbers(values)
     else:
-        out |= {"fullinertia": None, "diaginertia": numbers(inertia), "quat": numbers(turned)}
+        out |= {"fullinertia": None, "diaginertia": numbers(inertia), "quat": numbers(orientation)}
         out |= {turn: None for turn in TURNS}
-    edits.setdefault(own, {}).update({k: v for k, v in out.items() if v is not None or k in own.attributes})
+    edits.setdefault(inertial, {}).update({k: v for k, v in out.items() if v is not None or k in inertial.attributes})
 
 
-def _scaled(own: Tag, inertia: np.ndarray, said: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray] | None:
-    """The attribute and its numbers where all of a stated inertia grew by one factor; None otherwise."""
-    if "diaginertia" in said:
-        stated = np.sort(said["diaginertia"])
-    elif "fullinertia" in said:
-        xx, yy, zz, xy, xz, yz = said["fullinertia"]
-        stated = np.sort(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+def _scaled(inertia: np.ndarray, stated: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray] | None:
+    """The attribute and its numbers if the stated inertia is scaled by one factor; else None."""
+    if "diaginertia" in stated:
+        moments = np.sort(stated["diaginertia"])
+    elif "fullinertia" in stated:
+        xx, yy, zz, xy, xz, yz = stated["fullinertia"]
+        moments = np.sort(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     else:
         return None
-    shares = np.sort(inertia) / stated
-    kind = "diaginertia" if "diaginertia" in said else "fullinertia"
-    return (kind, said[kind] * shares.mean()) if np.ptp(shares) <= 1e-6 * abs(shares.mean()) else None
+    factors = np.sort(inertia) / moments
+    attribute = "diaginertia" if "diaginertia" in stated else "fullinertia"
+    same = np.ptp(factors) <= 1e-6 * abs(factors.mean())
+    return (attribute, stated[attribute] * factors.mean()) if same else None
 
 
 def _names(tree: Tree, main: str) -> dict[Path, str]:
-    """Name of each file in the folder of the result."""
+    """File -> its name in the folder of the result."""
     out = {tree.root.file: main}
     for file in tree.texts:
         name, k = f"{Path(main).stem}_parts/{file.name}", 2
@@ -324,7 +348,7 @@ def _names(tree: Tree, main: str) -> dict[Path, str]:
 def _absolute(
     tree: Tree, spec: mujoco.MjSpec, changed: Mapping[Path, str], names: Mapping[Path, str]
 ) -> dict[Tag, dict[str, str | None]]:
-    """Paths of included files, meshes and textures, so that the files can lie anywhere."""
+    """Edits that make the paths of included files, meshes and textures absolute."""
     folder, out = tree.root.file.parent, dict[Tag, dict[str, str | None]]()
     compilers = [tag for tag in tree.root.walk() if tag.name == "compiler"]
     for tag in compilers:
@@ -334,16 +358,17 @@ def _absolute(
     stated = {k for changes in out.values() for k in changes}
     if any(not os.path.isabs(file) for file in files) and not stated:
         if not compilers:
-            raise NotInPlace(f"{tree.root.file.name} has meshes or textures and no <compiler> to say where they lie")
+            raise NotInPlace(f"{tree.root.file.name} has meshes or textures and no <compiler> for their folder")
         out[compilers[0]] |= {"meshdir": str(folder), "texturedir": str(folder)}
-    own = {tag.file for tag, changes in out.items() if changes} | set(changed) | {tag.file for tag, _ in tree.includes}
+    edited = {tag.file for tag, changes in out.items() if changes} | set(changed)
+    edited |= {tag.file for tag, _ in tree.includes}
     for tag, file in tree.includes:
-        out[tag] = {"file": names[file] if file in own else str(file)}
+        out[tag] = {"file": names[file] if file in edited else str(file)}
     return {tag: changes for tag, changes in out.items() if changes}
 
 
 def _patch(tree: Tree, changed: Mapping[Path, str]) -> str:
-    """A unified diff of the user's own files, to be applied in the folder of the main one."""
+    """A unified diff of the user's files, to be applied in the folder of the main file."""
     out = ""
     for file, text in changed.items():
         name = os.path.relpath(file, tree.root.file.parent)

@@ -1,19 +1,18 @@
-"""What this package uses of mujoco-mjx 3.17.0 beyond its public interface, under names of our own.
+"""Private parts of mujoco-mjx 3.17.0 that this package uses, under its own names.
 
-Another MuJoCo may move or rename any of it; then this module changes and no other.  `tests/test_layers.py` holds that
-no other module names `_src` or `_impl`.
+Another version of MuJoCo may move or rename them; then only this module changes.  `tests/test_layers.py` checks that no
+other module uses `_src` or `_impl`.
 
-Two functions of mjx act differently while a simulation step is traced, and only then.  They are exchanged once, for
-ones that ask what holds where they are called: other threads, and other programs' traces, find what mjx does by itself.
+Two functions of mjx are replaced by versions that change their behaviour while a simulation step is traced.  A context
+variable switches them, so that other threads and other programs get mjx's behaviour.
 
-`exact_segments`: MJX adds 1e-6 m^2 to the squared length of a segment before it divides by it.  On
-a rail of 18 mm that moves a capsule's contact by 28 micrometres and turns its normal by 2 mrad.
+`exact_segments`: MJX adds 1e-6 m^2 to the squared length of a segment before it divides by it.  On a rail of 18 mm this
+moves a capsule's contact by 28 micrometres and turns its normal by 2 mrad.
 
-`midpoint_constraints`: MuJoCo damps a constraint with the velocity at the beginning of the step.
-Positions and forces belong to the middle of the velocity's step (semi-implicit Euler is a leapfrog
-scheme), so that damping is half a step late, and a sticking grasp, which has no memory of its
-position, creeps away by a tenth of a millimetre a second at 2 ms.  With the mean velocity of the
-step instead, v + h/2 J a, the law J a = -b v - k d r - R f becomes
+`midpoint_constraints`: MuJoCo damps a constraint with the velocity at the beginning of the step.  Positions and forces
+belong to the middle of the velocity's step (semi-implicit Euler is a leapfrog scheme).  So the damping is half a step
+late.  A sticking grasp, which has no memory of its position, then creeps by a tenth of a millimetre per second at 2 ms.
+With the mean velocity of the step, v + h/2 J a, the law J a = -b v - k d r - R f becomes
 J a = (-b v - k d r - R f) / (1 + b h / 2): b, k and R are divided by 1 + b h / 2.
 """
 
@@ -35,18 +34,22 @@ import jax.numpy as jnp
 import mujoco.mjx._src.constraint as _constraint
 import mujoco.mjx._src.math as _math
 
-# Where mjx looks up a function each time it is called, so that another one can take its place: module, name in it.
-Place = tuple[ModuleType, str]
-SEGMENT_POINT: Place = (_math, "closest_segment_point")  # a, b, p [3] m -> the point of the segment a-b closest to p
-CONSTRAINT_LAW: Place = (_constraint, "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
+# Module and name of a function of mjx, looked up at each call, so that it can be replaced.
+Replaced = tuple[ModuleType, str]
+SEGMENT_POINT: Replaced = (_math, "closest_segment_point")  # a, b, p [3] m -> the point of the segment a-b closest to p
+CONSTRAINT_LAW: Replaced = (_constraint, "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
 
 
 class ConstraintRows(NamedTuple):
-    """The constraint problem of a step: equalities first, then dry friction, then limits and contacts.
+    """The constraint rows of a step: equalities first, then dry friction, then limits and contacts.
 
-    jacobian: [rows, nv]; weight: [rows] 1/R, the inverse regularisation; reference: [rows] aref; friction: [rows] bound
-    of the force of dry friction, N m or N; force: [rows] of the last solution; equalities, frictions: how many rows
-    are of each, fixed when the model is put on the device.
+    Attributes:
+        jacobian: [rows, nv].
+        weight: [rows] 1/R, inverse regularisation.
+        reference: [rows] aref.
+        friction: [rows] N m or N, friction loss.
+        force: [rows] of the last solution.
+        equalities, frictions: numbers of these rows, fixed when the model is put on the device.
     """
 
     jacobian: jax.Array
@@ -59,10 +62,12 @@ class ConstraintRows(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Contacts of a step, as many as the model may have.
+    """All contacts that the model may have, in a step.
 
-    geoms: [contacts, 2] ids; distance: [contacts] m, negative where they penetrate; first_row: [contacts] of each one's
-    rows among the constraints.
+    Attributes:
+        geoms: [contacts, 2] ids.
+        distance: [contacts] m, negative for penetration.
+        first_row: [contacts] index of the first constraint row.
     """
 
     geoms: jax.Array
@@ -96,7 +101,7 @@ def contacts(data: Any) -> Contacts:
 
 
 def at_velocity(data: Any, velocity: jax.Array) -> Any:
-    """The mjx.Data with the actuators' speeds that joint velocities [nv] give."""
+    """The mjx.Data with the actuator velocities of joint velocities [nv]."""
     return data.tree_replace({"_impl.actuator_velocity": data._impl.actuator_moment @ velocity})
 
 
@@ -106,7 +111,7 @@ def tendon_jacobian(data: Any) -> jax.Array:
 
 
 def friction_dofs(model: Any) -> Any:
-    """[nv] bool, degrees of freedom with a row for dry friction; None where the implementation lays out all rows."""
+    """[nv] bool, degrees of freedom with a row for dry friction; None if the implementation lays out all rows."""
     return getattr(model._impl, "dof_hasfrictionloss", None)
 
 
@@ -121,13 +126,13 @@ def quat_multiply(one: jax.Array, other: jax.Array) -> jax.Array:
 
 
 def array_fields() -> frozenset[str]:
-    """Names of the fields of mjx.Model that are arrays of its program's input, not constants of the program."""
+    """Names of the fields of mjx.Model that are inputs of a program, not constants."""
     return frozenset(f.name for f in dataclasses.fields(cast(Any, mjx.Model)) if "jax.Array" in str(f.type))
 
 
-# ----- functions that are exchanged while a step is traced
+# ----- functions that are replaced while a step is traced
 
-_TINY = 1e-12  # m^2: keeps a segment of no length finite
+_TINY = 1e-12  # m^2, avoids a division by zero for a segment without length
 
 
 def closest_segment_point(a: jax.Array, b: jax.Array, pt: jax.Array) -> jax.Array:
@@ -140,8 +145,8 @@ def closest_segment_point(a: jax.Array, b: jax.Array, pt: jax.Array) -> jax.Arra
 def midpoint_law(original: Callable) -> Callable:
     """MJX's (stiffness, damping, impedance) of a constraint row, damped with the step's mean velocity.
 
-    The regularisation R is proportional to (1 - d) / d, so dividing R means another impedance d;
-    the stiffness is corrected for the d it is multiplied with.
+    The regularisation R is proportional to (1 - d) / d, so dividing R changes the impedance d.  The stiffness, which is
+    multiplied by d, is corrected for that.
     """
 
     def law(model: Any, solref: jax.Array, solimp: jax.Array, position: jax.Array) -> tuple[jax.Array, ...]:
@@ -153,15 +158,15 @@ def midpoint_law(original: Callable) -> Callable:
     return law
 
 
-def _switched(place: Place, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
-    """Exchange a function of mjx for one with two ways to act; the switch between them, off at first.
+def _switched(target: Replaced, new: Callable[[Callable], Callable]) -> ContextVar[bool]:
+    """Replace a function of mjx by one that a switch changes; returns the switch, off at first.
 
-    new: of mjx's own function, what acts while the switch is on.
+    new: original -> the function while the switch is on.
     """
-    module, name = place
+    module, name = target
     original = getattr(module, name)
-    if (before := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
-        return before
+    if (existing := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
+        return existing
     switch = ContextVar(name, default=False)
     other = new(original)
 

@@ -1,11 +1,11 @@
-"""The small linear systems of the constraint solver, many at a time, as the device likes them.
+"""Batches of small linear systems of the constraint solver, with an implementation for CPUs and one for GPUs.
 
     of_weights, solved = normal_equations(jacobian)
     change = solved(inertia + of_weights(curvature), pull)
 
-On a CPU the products of a row's entries are made once a step and packed, and LAPACK factors.  A GPU makes each product
-again sooner than it reads it, and plain arithmetic, which is fused, is faster than the batched calls of its libraries
-for matrices of eight rows (NVIDIA H200, door: `benchmarks/results/gpu.json`).
+On a CPU the products of a row's entries are computed once a step and packed, and LAPACK factors the matrix.  A GPU
+computes each product faster than it reads it.  For matrices of eight rows, fused arithmetic is faster there than
+batched library calls (NVIDIA H200, door: `benchmarks/results/gpu.json`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-UNROLLED = 12  # unknowns up to which a GPU solves without a library's call: a program grows with their third power
+UNROLLED = 12  # most unknowns that a GPU solves by unrolled arithmetic; the program's size grows with their cube
 
 
 def normal_equations(
@@ -42,33 +42,33 @@ def normal_equations(
 
 
 def by_cholesky(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """x of A x = b, by the library's factorisation."""
+    """x with A x = b, by a Cholesky factorisation of the library."""
     factor = jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
     half = jax.lax.linalg.triangular_solve(factor, right[:, None], left_side=True, lower=True)
     return jax.lax.linalg.triangular_solve(factor, half, left_side=True, lower=True, transpose_a=True)[:, 0]
 
 
 def unrolled(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """The same, written out entry by entry."""
+    """x with A x = b, by an unrolled Cholesky factorisation."""
     size = right.shape[0]
     factor: dict[tuple[int, int], jax.Array] = {}
     scale: list[jax.Array] = []  # 1 / diagonal of the factor
     half: list[jax.Array] = []
     for j in range(size):
         for i in range(j, size):
-            left = matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
+            remainder = matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
             if i == j:
-                scale.append(jax.lax.rsqrt(left))
-            factor[i, j] = left * scale[j]
+                scale.append(jax.lax.rsqrt(remainder))
+            factor[i, j] = remainder * scale[j]
         half.append((right[j] - sum(factor[j, k] * half[k] for k in range(j))) * scale[j])
-    found: dict[int, jax.Array] = {}
+    x: dict[int, jax.Array] = {}
     for i in reversed(range(size)):
-        found[i] = (half[i] - sum(factor[k, i] * found[k] for k in range(i + 1, size))) * scale[i]
-    return jnp.stack([found[i] for i in range(size)])
+        x[i] = (half[i] - sum(factor[k, i] * x[k] for k in range(i + 1, size))) * scale[i]
+    return jnp.stack([x[i] for i in range(size)])
 
 
 def _packed_index(size: int) -> np.ndarray:
-    """[size, size] place of each entry in a symmetric matrix's packed upper triangle."""
+    """[size, size] index of each entry of a symmetric matrix in its packed upper triangle."""
     entry = np.zeros((size, size), dtype=int)
     row, column = np.triu_indices(size)
     entry[row, column] = entry[column, row] = np.arange(len(row))

@@ -1,4 +1,4 @@
-"""Parameters of a user's own scene, from a JSON file.
+"""Read the parameters of a user's scene from a JSON file.
 
     [{"field": "dof_damping", "element": "elbow", "unit": "N m s/rad", "std": 0.5, "high": 10, "scaling": "log",
       "log_offset": 0.05},
@@ -9,36 +9,35 @@ Every entry needs field, element, std and high; optional: column, name, unit, me
 
     {"sensor": "coulomb", "element": "elbow", "std": 0.5, "high": 5}
 
-What a joint's sensors see beyond the model has "sensor" in place of "field": viscous, coulomb, torque_offset,
-torque_gain (model/joint_friction.py) or encoder_offset (model/encoders.py) of a joint, zero at first and between -high
-and high.
+A parameter of a joint's sensors has "sensor" in place of "field": viscous, coulomb, torque_offset, torque_gain
+(model/joint_friction.py) or encoder_offset (model/encoders.py).  Its mean is zero, its bounds are -high and high.
 
     {"sensor": "time_offset", "std": 0.001, "high": 0.05}
     {"servo": "elbow", "std": 0.03}
 
-The delay of the commands, s, a nuisance unless it says otherwise, and a factor on the position gain of a joint's
-servo have no element.
+The delay of the commands [s], a nuisance by default, and a factor on the position gain of a joint's servo have no
+element.
 
     {"motor": "stall_torque", "element": "elbow", "std": 0.2}
 
-A factor on a number of the DC motor of a joint's servo: stall_torque, no_load_speed, torque_constant or resistance
+A factor on a property of the DC motor of a joint's servo: stall_torque, no_load_speed, torque_constant or resistance
 (model/dc_motor.py).
 
     {"field": "dof_armature", "element": ["shoulder", "elbow"], "name": "rotor", "std": 0.01, "high": 0.2}
 
-A list of elements (of joints, for "servo" and "motor") or of columns makes one parameter that they share.
+A list of elements (for "servo" and "motor" of joints) or of columns makes one shared parameter.
 
     {"field": "dof_armature", "element": ["shoulder", "elbow"], "each": true, "name": "rotor", "std": 0.01, "high": 0.2}
 
-With "each" it makes one for each element, "rotor_shoulder" and "rotor_elbow".
+With "each" it makes one parameter for each element, "rotor_shoulder" and "rotor_elbow".
 
     {"like": "rotor", "name": "second rotor"}
 
-A parameter of the same bounds and prior that stands for another one in recordings that say so (`Recording.known`).
+A parameter with the bounds and prior of another one, which it replaces in recordings that say so (`Recording.known`).
 
     {"inertia": "forearm", "std": 0.1}
 
-The whole inertia of a body, ten parameters that are a possible body at every value (model/inertia.py).
+The whole inertia of a body, as ten parameters that are physically consistent at all values (model/inertia.py).
 """
 
 from __future__ import annotations
@@ -70,17 +69,17 @@ from droid_jax.model.parameters import Mode, Parameter, Role, Scaling, Space
 from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json, typed
 
-_KINDS = ("field", "sensor", "servo", "motor")  # of entries of one parameter
+_KINDS = ("field", "sensor", "servo", "motor")  # keys that choose the type of an entry of one parameter
 _INERTIA, _LIKE = "inertia", "like"
 _OF_LIKE = (_LIKE, "name", "std", "high", "low", "mean", "nuisance", "group")
 _OF_INERTIA = (_INERTIA, "std", "high", "nuisance", "group")
 _NEEDED = ("element", "std", "high")
 _TIME = Role.TIME_OFFSET.value
-SMALL = 1e-3  # of its deviation: a mean (and log_offset) below it is out of reach of a search in the logarithm
+LEAST_LOG_MEAN = 1e-3  # of its deviation, least mean + log_offset from which a logarithmic search can progress
 
 
 class _Entry(msgspec.Struct, forbid_unknown_fields=True):
-    """An entry of the file, whatever its kind."""
+    """The keys of all types of entries."""
 
     field: str | msgspec.UnsetType = msgspec.UNSET
     sensor: str | msgspec.UnsetType = msgspec.UNSET
@@ -113,11 +112,11 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
 
     Args:
         path: of the file.
-        scene: whose elements the entries name.
+        scene: with the elements.
 
     Returns:
-        A space of one parameter for each entry, of ten for each inertia, of one for each element where an entry has
-        "each", in the file's order.
+        The parameters in the file's order: one for each entry, ten for an inertia, one for each element of an entry
+        with "each".
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -138,20 +137,20 @@ def load_parameters(path: str | Path, scene: Scene) -> Space:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for p in space.parameters:
-        if p.scaling is Scaling.LOG and p.mean + p.log_offset < SMALL * p.std:
+        if p.scaling is Scaling.LOG and p.mean + p.log_offset < LEAST_LOG_MEAN * p.std:
             warnings.warn(
-                f"{path}: {p.name!r} is searched in the logarithm from {p.mean:g} {p.unit}, where nothing that it does "
-                'is felt yet: give a "mean" of the size that you expect, or a "log_offset"',
+                f"{path}: {p.name!r} is searched in the logarithm from {p.mean:g} {p.unit}, where it has no effect "
+                'yet: give a "mean" of the size that you expect, or a "log_offset"',
                 stacklevel=2,
             )
     return space
 
 
 def friction_joints(path: str | Path) -> tuple[str, ...]:
-    """Joints whose friction loss the file asks for: the scene must be compiled with a row for them."""
+    """Joints with a friction loss in the file, for which the scene must be compiled with a constraint row."""
     entries: list[dict[str, Any]] = [e for e in _entries(Path(path)) if isinstance(e, dict)]
-    asked = [e["element"] for e in entries if e.get("field") == "dof_frictionloss" and "element" in e]
-    return tuple(str(joint) for element in asked for joint in _each(element))
+    elements = [e["element"] for e in entries if e.get("field") == "dof_frictionloss" and "element" in e]
+    return tuple(str(joint) for element in elements for joint in _as_list(element))
 
 
 def _entries(path: Path) -> list[Any]:
@@ -165,7 +164,7 @@ def _entries(path: Path) -> list[Any]:
 
 
 def _parameters(scene: Scene, given: Any, where: str, before: Mapping[str, Parameter]) -> Sequence[Parameter]:
-    """Those of an entry; before: those of the entries before it."""
+    """The parameters of an entry; before: the parameters of the entries before it, by name."""
     if not isinstance(given, dict):
         raise ValueError(f"{where}: expected an object, got {type(given).__name__}")
     entry = cast(dict[str, Any], given)
@@ -176,24 +175,24 @@ def _parameters(scene: Scene, given: Any, where: str, before: Mapping[str, Param
     if wrong := faults({"missing": missing, "unknown": unknown}):
         raise ValueError(f"{where}: {wrong}; known keys: {', '.join(_KNOWN)}")
     if extra := [k for k in _useless(entry) if k in entry]:
-        raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its kind has no use for")
+        raise ValueError(f"{where}: leave {', '.join(extra)} out, which an entry of its type does not have")
     read = msgspec.structs.asdict(typed(entry, _Entry, where))
     options: dict[str, Any] = {key: value for key, value in read.items() if value is not msgspec.UNSET}
     try:
         if _INERTIA in options:
             return inertia_parameters(scene, options.pop(_INERTIA), **options)
         if _LIKE in options:
-            return [_alike(before, options.pop(_LIKE), **options)]
-        alone = _apart(options) if options.pop("each", False) else [options]
-        return [_shared(scene, one) if _several(one) else _single(scene, one) for one in alone]
+            return [_replacement(before, options.pop(_LIKE), **options)]
+        separate = _for_each(options) if options.pop("each", False) else [options]
+        return [_shared(scene, one) if _several(one) else _single(scene, one) for one in separate]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _alike(before: Mapping[str, Parameter], like: str, **options: Any) -> Parameter:
-    """A parameter that stands for one of those before it."""
+def _replacement(before: Mapping[str, Parameter], like: str, **options: Any) -> Parameter:
+    """A parameter that replaces one of `before` in some recordings."""
     if like not in before:
-        raise ValueError(f"no entry before it has the name {like!r}; there: {', '.join(before) or 'none'}")
+        raise ValueError(f"no entry before it has the name {like!r}; names are: {', '.join(before) or 'none'}")
     return replace(before[like], writes=(), role=Role.STANDS_FOR, **options)
 
 
@@ -212,32 +211,34 @@ def _several(options: Mapping[str, Any]) -> bool:
     return isinstance(options.get("element", options.get("servo")), list) or isinstance(options.get("column"), list)
 
 
-def _apart(options: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """An entry for each element, named after it."""
+def _for_each(options: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One entry for each element, with a name that contains the element's."""
     which = "servo" if "servo" in options else "element"
     elements = options.get(which)
     if not isinstance(elements, list) or not elements:
-        raise ValueError(f'"each" is of a list of elements; {which} is {elements!r}')
+        raise ValueError(f'"each" needs a list of elements; {which} is {elements!r}')
     name = options.get("name")
-    named = [{} if name is None else {"name": f"{name}_{element}"} for element in cast(list[str], elements)]
-    return [{**options, which: element, **own} for element, own in zip(cast(list[str], elements), named, strict=True)]
+    names = [{} if name is None else {"name": f"{name}_{element}"} for element in cast(list[str], elements)]
+    return [
+        {**options, which: element, **named} for element, named in zip(cast(list[str], elements), names, strict=True)
+    ]
 
 
 def _shared(scene: Scene, options: Mapping[str, Any]) -> Parameter:
     """One parameter of several elements, of several columns, or both."""
     which = "servo" if "servo" in options else "element"
     if "sensor" in options:
-        raise ValueError("a sensor's term belongs to one joint: give each an entry of its own")
-    columns = {"column": _each(options["column"])} if "column" in options else {}
-    keys, choices = (which, *columns), (_each(options[which]), *columns.values())
+        raise ValueError("a sensor's term belongs to one joint: write an entry for each joint")
+    columns = {"column": _as_list(options["column"])} if "column" in options else {}
+    keys, choices = (which, *columns), (_as_list(options[which]), *columns.values())
     if not all(choices):
-        raise ValueError(f"{which}: an empty list names nothing")
+        raise ValueError(f"{which}: the list is empty")
     combinations = [dict(zip(keys, choice, strict=True)) for choice in itertools.product(*choices)]
     parts = [_single(scene, {**options, **combination}) for combination in combinations]
     return shared(parts, name=options.get("name"))
 
 
-def _each(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return cast(list[Any], value) if isinstance(value, list) else [value]
 
 
@@ -273,7 +274,7 @@ def _check_measured(scene: Scene, joint: str) -> None:
 
 
 def _useless(entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """Keys that an entry of this kind does not have: a sensor's name is the one that the replay looks it up by."""
+    """Keys that an entry of this type does not have.  A sensor's has no name, since the replay reads a fixed one."""
     if _INERTIA in entry:
         return tuple(key for key in _KNOWN if key not in (*_KINDS, *_OF_INERTIA))
     if _LIKE in entry:

@@ -1,16 +1,13 @@
 """Physics parameters as one named vector: `Parameter` and `Space`.
 
-A `Parameter` says what it is (name, unit, bounds, initial mean and deviation) and what it
-writes: fields of the MuJoCo model (`writes`), or one entry of `theta`, the dictionary of
-quantities that live outside the model (a time offset, a torque offset, an effect's
-coefficient).  A `Space` is an ordered tuple of them; a parameter vector is an array [..., D]
-of physical values in that order.
+A `Parameter` has a name, a unit, bounds, and an initial mean and deviation.  It writes fields of the MuJoCo model
+(`writes`) or is one entry of `theta`, the dictionary of quantities outside the model (a time offset, a torque offset,
+an effect's coefficient).  A `Space` is an ordered tuple of parameters.  A parameter vector is an array [..., D] of
+physical values in that order.
 
-Search coordinates: the search and the Gaussian move in coordinates x [..., D] in which one
-unit is about one prior deviation.  `Scaling.LINEAR` is x = (v - mean) / std.
-`Scaling.LOG` is x = (log(v + log_offset) - log(mean + log_offset)) / width: positive parameters stay
-positive, and with log_offset > 0 a value of exactly zero is still reachable (a door without
-friction loss).
+Searches and Gaussians use search coordinates x [..., D], in which one unit is about one prior deviation.
+`Scaling.LINEAR` is x = (v - mean) / std.  `Scaling.LOG` is x = (log(v + log_offset) - log(mean + log_offset)) / width.
+It keeps positive parameters positive.  With log_offset > 0, zero can be reached (a door without friction loss).
 """
 
 from __future__ import annotations
@@ -38,8 +35,8 @@ from droid_jax.arguments import (
     whole,
 )
 
-MOST_ROWS = 10**9  # of a model's field
-ROUNDING = 1e-6  # share of a parameter's range by which a value may miss a bound
+MOST_ROWS = 10**9  # largest index into a model's field
+ROUNDING = 1e-6  # share of a parameter's range by which a value may exceed a bound
 
 
 class Mode(enum.Enum):
@@ -54,15 +51,16 @@ class Mode(enum.Enum):
 
 @dataclass(frozen=True)
 class Write:
-    """One assignment of a parameter's value to entries of a model field.
+    """An assignment of a parameter's value to an entry of a model field.
 
-    field: name of an MjModel / mjx.Model array, e.g. "dof_damping".
-    index: numpy index into it, a tuple of integers (ids are resolved once, from names).
-    mode:  how value and nominal number combine.
-    gain:  the value is multiplied by this first (mode SET of a mass uses 1; the inertia that
-           scales with it uses SCALE with gain 1 / nominal mass).
-    offset: added after the gain (a relative error e enters as SCALE by 1 + e).
-    element: name of the MJCF's element whose entry it is, "" where it has none: so that another scene's is noticed.
+    Attributes:
+        field: name of an array of MjModel and mjx.Model, such as "dof_damping".
+        index: numpy index into it, a tuple of integers.
+        mode: how value and nominal number combine.
+        gain: factor on the value, applied first (an inertia that scales with a mass uses SCALE with gain 1 / nominal
+            mass).
+        offset: added after the gain (a relative error e uses SCALE with offset 1).
+        element: name of the MJCF element of the entry, "" if it has none; it detects parameters of another scene.
     """
 
     field: str
@@ -86,7 +84,7 @@ class Write:
         name(self.element, f"{where}: element", empty=True)
 
     def new(self, nominal: Any, value: Any) -> Any:
-        """The field's new number(s) for a value; works on numpy and jax arrays alike."""
+        """The field's new number(s) for a value; numpy or jax."""
         value = value * self.gain + self.offset
         if self.mode is Mode.SET:
             return value
@@ -99,40 +97,40 @@ class Write:
         return nominal + value
 
     def neutral(self, nominal: Any) -> Any:
-        """The value that leaves the field as it is: the inverse of `new`."""
+        """The value that leaves the field unchanged."""
         same = {Mode.SET: nominal, Mode.NEGATIVE: -nominal, Mode.ADD: 0.0}.get(self.mode, 1.0)
         return (same - self.offset) / self.gain
 
 
 class Scaling(enum.Enum):
-    """Search coordinate of a parameter: the value itself, or its logarithm (see the module's text)."""
+    """Search coordinate of a parameter: linear or logarithmic in its value (see the module's text)."""
 
     LINEAR = "linear"
     LOG = "log"
 
 
 class Role(enum.Enum):
-    """What a parameter is, for code that treats parameters of its kind in a way of their own.
+    """The role of a parameter, for code that treats some parameters specially.
 
-    The roles of the first block are what a replay reads from theta beside effects: their values are its names there,
-    of a joint with the joint in brackets (`in_theta`).
+    A replay reads parameters with roles of the first block from theta.  Their names there are the roles' values, with
+    the joint in brackets if there is one for each joint (`in_theta`).
     """
 
     TIME_OFFSET = "time_offset"  # s, delay of the command
     TORQUE_OFFSET = "torque_offset"  # N m, constant error of a joint's torque sensor
     TORQUE_GAIN = "torque_gain"  # relative error of a joint's torque sensor
-    VISCOUS = "viscous"  # N m s/rad, friction that a joint's torque sensor sees
+    VISCOUS = "viscous"  # N m s/rad, friction that a joint's torque sensor measures
     COULOMB = "coulomb"  # N m, likewise
 
     SLIDING_FRICTION = "sliding_friction"  # of a finger's contact
     TORSIONAL_FRICTION = "torsional_friction"  # likewise, m
-    PAYLOAD_MASS = "payload_mass"  # kg that the arm carries at its hand beside what the model says
-    OBJECT_TORQUE = "object_torque"  # N m (N of a slide), constant on the object's joint
-    STANDS_FOR = "stands_for"  # another parameter, in recordings that say so (`Recording.known`)
+    PAYLOAD_MASS = "payload_mass"  # kg, carried at the hand in addition to the model's masses
+    OBJECT_TORQUE = "object_torque"  # N m (N for a slide), constant on the object's joint
+    STANDS_FOR = "stands_for"  # replaces another parameter in recordings that say so (`Recording.known`)
     OTHER = "other"
 
     def in_theta(self, joint: str = "") -> str:
-        """Name in theta of what a replay reads, of a joint where it is one's."""
+        """Name in theta, with the joint in brackets if one is given."""
         return f"{self.value}[{joint}]" if joint else self.value
 
 
@@ -140,12 +138,12 @@ OF_A_JOINT = (Role.VISCOUS, Role.COULOMB, Role.TORQUE_OFFSET, Role.TORQUE_GAIN)
 
 
 def role_in_theta(name: str) -> Role:
-    """What a replay reads by this name from theta; OTHER where it reads nothing by it, or an effect does."""
+    """The role of a parameter with this name in theta; OTHER if only effects read it."""
     if name == Role.TIME_OFFSET.value:
         return Role.TIME_OFFSET
     term, bracket, joint = name.partition("[")
-    found = {role.value: role for role in OF_A_JOINT}.get(term, Role.OTHER)
-    return found if bracket and joint.endswith("]") else Role.OTHER
+    role = {role.value: role for role in OF_A_JOINT}.get(term, Role.OTHER)
+    return role if bracket and joint.endswith("]") else Role.OTHER
 
 
 @dataclass(frozen=True)
@@ -157,18 +155,16 @@ class Parameter:
         unit: for tables and axes, e.g. "N m/rad".
         mean, std: initial Gaussian, in `unit` (Table I of the paper for the door).
         low, high: bounds, in `unit`; low <= mean <= high and low < high.
-        writes: model fields it sets; empty for a parameter that lives in theta.
-        nuisance: fitted and marginalised, of no interest by itself.
+        writes: model fields that it sets; empty for a parameter in theta.
+        nuisance: whether it is fitted and marginalised, but of no interest.
         group: heading in tables ("Door", "Robot", "Gripper", "Nuisance").
         scaling, log_offset: search coordinate, see the module's text.
-        width: what one unit of the search coordinate is in log(v + log_offset) when scaling is LOG; None takes it from
-            mean and std.
-        role: what it is, where code treats its kind in a way of its own. Of a parameter that writes nothing it follows
-            from the name that a replay reads it by.
+        width: one unit of the search coordinate in log(v + log_offset) if scaling is LOG; None: from mean and std.
+        role: for code that treats some parameters specially. That of a parameter in theta follows from its name.
 
     Raises:
-        ValueError: an attribute is of the wrong type, the bounds do not hold the mean, or the numbers are too large or
-            too small to search among.
+        ValueError: an attribute is of the wrong type, the mean is out of bounds, or the numbers are too large or too
+            small for the search coordinate.
     """
 
     name: str
@@ -215,7 +211,7 @@ class Parameter:
             raise ValueError(f"parameter {self.name!r}: its numbers are too large or too small to search among")
 
     def _mapped(self) -> bool:
-        """Whether the logarithmic map is finite and of positive width at the bounds."""
+        """Whether the logarithmic coordinate has a positive width and is finite at the bounds."""
         if not (self.high + self.log_offset < math.inf and self.log_width > 0):
             return False
         ends = (math.log((end + self.log_offset) / (self.mean + self.log_offset)) for end in (self.low, self.high))
@@ -223,7 +219,7 @@ class Parameter:
 
     @property
     def log_width(self) -> float:
-        """Deviation of log(v + log_offset) that counts as one unit of the search coordinate."""
+        """One unit of the search coordinate in log(v + log_offset)."""
         if self.width is not None:
             return self.width
         return math.log1p(self.std / (self.mean + self.log_offset))
@@ -247,7 +243,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Space:
-    """An ordered set of parameters: the meaning of a vector's entries.
+    """An ordered set of parameters, which gives a vector's entries their meaning.
 
     Attributes:
         parameters: [D] of unique names.
@@ -283,7 +279,7 @@ class Space:
         return tuple(self._index)
 
     def index(self, name: str) -> int:
-        """Position of a parameter; an unknown name raises and lists the valid ones."""
+        """Index of a parameter; an unknown name raises ValueError, which lists the valid ones."""
         try:
             return self._index[name]
         except (KeyError, TypeError):
@@ -322,67 +318,74 @@ class Space:
         return Space(tuple(self[n] for n in several(name)(names, "names")))
 
     def of_role(self, *roles: Role) -> tuple[Parameter, ...]:
-        """The parameters that are one of these, in the space's order; none where there are none."""
+        """The parameters with one of these roles, in the space's order."""
         return tuple(p for p in self.parameters if p.role in roles)
 
     def with_prior(self, **prior: tuple[float, float]) -> Space:
-        """A copy in which some parameters start from another (mean, std)."""
+        """A copy with other priors (mean, std) of some parameters."""
         changed = list(self.parameters)
-        for of, pair in prior.items():
-            i, given = self.index(of), cast(Any, pair)
+        for parameter, pair in prior.items():
+            i, given = self.index(parameter), cast(Any, pair)
             if not isinstance(given, (tuple, list)) or len(pair) != 2:
-                raise ValueError(f"the prior of {of!r} must be its mean and deviation, got {shown(given)}")
+                raise ValueError(f"the prior of {parameter!r} must be its mean and deviation, got {shown(given)}")
             changed[i] = replace(changed[i], mean=pair[0], std=pair[1])
         return Space(tuple(changed))
 
     def linear(self) -> Space:
-        """A copy that searches in linear coordinates, as the paper does."""
+        """A copy with linear search coordinates, as in the paper."""
         return Space(tuple(replace(p, scaling=Scaling.LINEAR) for p in self.parameters))
 
     def values(self, values: dict[str, float] | None = None) -> np.ndarray:
         """[D] the means, with some entries replaced by name."""
         out = self.mean
-        for of, value in mapping({} if values is None else values, "values").items():
-            out[self.index(of)] = number(value, f"the value of {of!r}")
+        for parameter, value in mapping({} if values is None else values, "values").items():
+            out[self.index(parameter)] = number(value, f"the value of {parameter!r}")
         return out
 
     def columns(self, part: Space) -> list[int]:
-        """Positions here of another space's parameters."""
+        """Indices in this space of another space's parameters."""
         return [self.index(n) for n in part.names]
 
     def embed(self, part: Space, rows: Any, values: np.ndarray | None = None) -> np.ndarray:
-        """[P, D] the vector `values` [D] (default: the means) with the entries of `part` replaced by rows [P, F]."""
+        """[P, D] copies of `values` [D] (None: the means) with the entries of `part` replaced by rows [P, F]."""
         out = np.tile(self.mean if values is None else values, (len(rows), 1))
         out[:, self.columns(part)] = np.asarray(rows)
         return out
 
     def with_known(self, known: Mapping[str, float | str], values: Any) -> Any:
-        """Rows [..., D] with what is known of some parameters in their place, or what stands for them.
+        """Vectors [..., D] in which known values replace those of some parameters.
 
-        Raises ValueError for an unknown name, or a value outside the parameter's bounds.
+        Args:
+            known: parameter -> its known value, or the parameter whose value it has (`Recording.known`).
+            values: [..., D].
+
+        Raises:
+            ValueError: a name is unknown, or a value is outside the parameter's bounds.
         """
         if not known:
             return values
         out = np.array(values)
-        for of, value in known.items():
-            if strange := [n for n in (of, value) if isinstance(n, str) and n not in self._index]:
+        for parameter, value in known.items():
+            if unknown := [n for n in (parameter, value) if isinstance(n, str) and n not in self._index]:
                 raise ValueError(
-                    f"a recording states {', '.join(strange)} (known), which is no parameter here: list it, give the "
+                    f"a recording states {', '.join(unknown)} (known), which is no parameter here: list it, give the "
                     "effect that has it (--effects), or convert without --known; there are: " + ", ".join(self.names)
                 )
-            p = self[of]
+            p = self[parameter]
             if isinstance(value, str):
-                out[..., self.index(of)] = np.asarray(values)[..., self.index(value)]
+                out[..., self.index(parameter)] = np.asarray(values)[..., self.index(value)]
                 continue
             if not p.low <= value <= p.high:
-                raise ValueError(f"{of!r} is said to be {value:g} {p.unit}, outside its bounds [{p.low}, {p.high}]")
-            out[..., self.index(of)] = value
+                raise ValueError(
+                    f"a recording states {parameter!r} to be {value:g} {p.unit}, outside its bounds [{p.low}, {p.high}]"
+                )
+            out[..., self.index(parameter)] = value
         return out
 
     def check(self, values: np.ndarray) -> np.ndarray:
-        """values [..., D] as float64, or ValueError that says which entry is wrong and how.
+        """Values [..., D] as float64; ValueError says which entry is wrong and how.
 
-        What single precision made of a bound counts as on it, and is returned as the bound itself.
+        A value that exceeds a bound by rounding to single precision is returned as the bound.
         """
         values = numeric(values, "parameter vectors")
         if values.shape[-1:] != (len(self),):
@@ -417,8 +420,8 @@ class Space:
 
 
 def _namespace(array: Any) -> Any:
-    """numpy for host values, jax.numpy for anything jax holds or traces."""
-    if type(array).__module__.split(".")[0] not in ("jax", "jaxlib"):  # without importing jax, which takes a second
+    """numpy for host arrays, jax.numpy for arrays and tracers of jax."""
+    if type(array).__module__.split(".")[0] not in ("jax", "jaxlib"):  # does not import jax, which takes a second
         return np
     import jax.numpy as jnp
 

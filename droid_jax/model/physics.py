@@ -1,8 +1,7 @@
-"""Parameter values -> a model to simulate: `Physics` for MJX and its counterpart for MuJoCo in C.
+"""Apply parameter values to a model: `Physics` for MJX, and an MjModel for C MuJoCo.
 
-Mass, inertia and geometry enter quantities that the compiler derives (inverse weights, the
-diagonal of the inertia matrix, subtree masses).  Both paths derive them again, so that applying
-values equals compiling an MJCF that has them.
+The compiler derives quantities from mass, inertia and geometry (inverse weights, the diagonal of the inertia matrix,
+subtree masses).  Both functions derive them again, so that applying values equals compiling an MJCF with them.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
 from droid_jax.runtime import first_device
 
-# Writing one of these changes what the compiler derives.
+# Fields from which the compiler derives others.
 _SOURCES = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature",
             "jnt_pos", "jnt_axis"}  # fmt: skip
-_PLACES = {"geom_pos", "geom_quat"}  # of which C keeps whether they are the body's own
+_PLACES = {"geom_pos", "geom_quat"}  # C MuJoCo stores whether these frames are the body's
 DERIVED = (
     "body_subtreemass",
     "body_invweight0",
@@ -40,20 +39,21 @@ DERIVED = (
     "eq_data",
     "stat",
 )
-# Writes set one component of these at a time; a compiler, and engines in their own ways, make them unit vectors.
+# Fields of unit vectors, which are normalised after single components are written.
 UNIT = ("body_quat", "body_iquat", "geom_quat", "site_quat", "jnt_axis")
-POSE = slice(3, 10)  # columns of MjModel.eq_data that follow from where two joined bodies stand
-_AUTOMATIC = 11  # column of MjModel.eq_data that is 1 where the compiler worked a weld's pose out
-_SLIDES_ONLY = 2  # MjModel.body_simple of a body whose inertia is its mass alone
+POSE = slice(3, 10)  # columns of MjModel.eq_data that follow from the poses of two joined bodies
+_AUTOMATIC = 11  # column of MjModel.eq_data that is 1 if the compiler derived a weld's pose
+_SLIDES_ONLY = 2  # MjModel.body_simple of a body on slides, whose inertia matrix contains only its mass
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Physics:
-    """A model with the fields that parameters write, and the parameters that live outside it.
+    """A model with parameter values applied, and the parameters outside it.
 
-    model: mjx.Model.
-    theta: name -> scalar, for parameters without model fields (offsets, effects).
+    Attributes:
+        model: mjx.Model.
+        theta: name -> scalar, for parameters without model fields (offsets, effects).
     """
 
     model: Any
@@ -61,12 +61,12 @@ class Physics:
 
 
 def model_writes(space: Space) -> tuple[tuple[int, Write], ...]:
-    """(column of the vector, write) for every model entry the space sets."""
+    """(column of the vector, write) for all writes of the space."""
     return tuple((i, w) for i, p in enumerate(space.parameters) for w in p.writes)
 
 
 def written_fields(space: Space) -> tuple[str, ...]:
-    """Names of the model fields that applying a vector changes, derived ones included."""
+    """Names of the model fields that applying a vector changes, including derived ones."""
     fields = dict.fromkeys(field for field, _ in entries_written(space))
     if _SOURCES & set(fields):
         fields.update(dict.fromkeys(DERIVED))
@@ -74,12 +74,12 @@ def written_fields(space: Space) -> tuple[str, ...]:
 
 
 def entries_written(space: Space) -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """(field, index) of MuJoCo's own fields that parameters set; index of a row where all of it is set together."""
+    """(field, index) of MuJoCo's fields that parameters set; the index of a row if the whole row is set."""
     return as_written(tuple((w.field, w.index) for _, w in model_writes(space)))
 
 
 def check_field(scene: Scene, field: str) -> None:
-    """Raise ValueError for a field of the C model that MJX does not have, takes as fixed, or does not read here."""
+    """Raise ValueError for a field that MJX does not have, treats as constant, or does not read for this scene."""
     if field == PSEUDO_INERTIA:
         return
     if field not in _varied_fields() or np.asarray(getattr(scene.model, field)).dtype.kind != "f":
@@ -87,20 +87,20 @@ def check_field(scene: Scene, field: str) -> None:
     if field == "body_gravcomp" and not scene.model.body_gravcomp.any():
         raise ValueError(
             f"'body_gravcomp' cannot be a parameter: scene {scene.name!r} was compiled without gravity compensation, "
-            "which MJX then leaves out; give a body gravcomp in the MJCF"
+            "so MJX does not compute it; set gravcomp of a body in the MJCF"
         )
 
 
 @functools.cache
 def _varied_fields() -> frozenset[str]:
-    """Fields of mjx.Model that are arrays of its program's input, not constants of the program, and are read."""
+    """Fields of mjx.Model that are inputs of a program and are read."""
     return array_fields() - {field for field, _ in IGNORED}
 
 
 def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
-    """The physics of one parameter vector [D]; traceable, so vmap it over samples.
+    """The physics of one parameter vector [D]; traceable, to be vmapped over samples.
 
-    Raises ValueError for fields that MJX would not read (see `check_field`).
+    Raises ValueError for fields that MJX does not read (see `check_field`).
     """
     model = scene.mjx
     by_field: dict[str, list[tuple[int, Write]]] = {}
@@ -109,19 +109,19 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
     changed = {}
     for field, writes in by_field.items():
         check_field(scene, field)
-        own = jnp.asarray(nominal_field(model, field), jnp.float32 if field == PSEUDO_INERTIA else None)
+        nominal = jnp.asarray(nominal_field(model, field), jnp.float32 if field == PSEUDO_INERTIA else None)
         new: dict[tuple[int, ...], jax.Array] = {}
-        for column, w in writes:  # several parameters of one entry act one after the other
-            new[w.index] = w.new(new.get(w.index, own[w.index]), values[column])
+        for column, w in writes:  # several writes of one entry are applied in their order
+            new[w.index] = w.new(new.get(w.index, nominal[w.index]), values[column])
         index = tuple(np.array(axis) for axis in zip(*new, strict=True))
-        changed[field] = own.at[index].set(jnp.stack(list(new.values())).astype(own.dtype))
+        changed[field] = nominal.at[index].set(jnp.stack(list(new.values())).astype(nominal.dtype))
     if PSEUDO_INERTIA in changed:
         terms = changed.pop(PSEUDO_INERTIA)
         check_single_inertia(space)
         for body in dict.fromkeys(w.index[0] for _, w in by_field[PSEUDO_INERTIA]):
             for field, number in inertial_fields(scene.model, body, terms[body], jnp).items():
-                own = changed.get(field, jnp.asarray(getattr(model, field)))
-                changed[field] = own.at[body].set(number.astype(own.dtype))
+                array = changed.get(field, jnp.asarray(getattr(model, field)))
+                changed[field] = array.at[body].set(number.astype(array.dtype))
     for field in set(UNIT) & set(changed):
         changed[field] /= jnp.linalg.norm(changed[field], axis=1, keepdims=True)
     model = model.replace(**changed)
@@ -131,12 +131,12 @@ def make_physics(scene: Scene, space: Space, values: jax.Array) -> Physics:
 
 
 def derive(model: Any) -> Any:
-    """Recompute what mj_setConst derives from masses, inertias and geometry at the pose qpos0.
+    """An mjx.Model with the fields that mj_setConst derives from masses, inertias and geometry at the pose qpos0.
 
-    body_subtreemass, body_invweight0 [nbody,2], dof_invweight0 [nv], dof_M0 [nv], tendon_length0 and
-    tendon_invweight0 [ntendon], eq_data of connected and welded bodies, stat.meaninertia and stat.meanmass.
-    As in C, free and ball joints average over their degrees of freedom, a lone body on slides counts with its
-    mass alone, and dof_M0 alone knows no armature of tendons.
+    These are body_subtreemass, body_invweight0 [nbody, 2], dof_invweight0 [nv], dof_M0 [nv], tendon_length0 and
+    tendon_invweight0 [ntendon], eq_data of connected and welded bodies, stat.meaninertia and stat.meanmass.  As in C,
+    free and ball joints average over their degrees of freedom, the inverse weight of a body on slides is that of its
+    mass, and dof_M0 does not contain the armature of tendons.
     """
     data: Any = mjx.make_data(model, device=first_device()).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
@@ -170,9 +170,9 @@ def derive(model: Any) -> Any:
 
 
 def _equality_data(model: Any, data: Any) -> jax.Array:
-    """eq_data of two bodies as they stand at qpos0: where a connect's anchor is in the second one, and a weld's pose.
+    """eq_data of joined bodies at qpos0: a connect's anchor in the second body, and a weld's relative pose.
 
-    As mj_setConst works it out: a pose that the MJCF states stays.
+    As in mj_setConst, a pose that the MJCF states is unchanged.
     """
     numbers = jnp.asarray(model.eq_data)
     for kind, rows in joined_bodies(model).items():
@@ -187,21 +187,21 @@ def _equality_data(model: Any, data: Any) -> jax.Array:
         place = jnp.einsum("eji,ej->ei", turned[one], world - at[one])
         back = data.xquat[one] * jnp.array([1.0, -1.0, -1.0, -1.0])
         pose = jnp.concatenate([place, jax.vmap(quat_multiply)(back, data.xquat[two])], axis=1)
-        own = numbers[rows, _AUTOMATIC, None] > 0
-        numbers = numbers.at[rows, POSE].set(jnp.where(own, pose, numbers[rows, POSE]))
+        automatic = numbers[rows, _AUTOMATIC, None] > 0
+        numbers = numbers.at[rows, POSE].set(jnp.where(automatic, pose, numbers[rows, POSE]))
     return numbers
 
 
 def joined_bodies(model: Any) -> dict[mujoco.mjtEq, np.ndarray]:
-    """Rows of eq_data that connect or weld two bodies, by kind, those kinds of which there are any."""
+    """Kind of equality (connect, weld) -> rows of eq_data between two bodies, if there are any."""
     between = np.asarray(model.eq_objtype) == mujoco.mjtObj.mjOBJ_BODY
     kinds = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
     rows = {kind: np.flatnonzero(between & (np.asarray(model.eq_type) == kind)) for kind in kinds}
-    return {kind: found for kind, found in rows.items() if found.size}
+    return {kind: of_kind for kind, of_kind in rows.items() if of_kind.size}
 
 
 def _ancestors(model: Any) -> np.ndarray:
-    """[nbody, nbody] True where the column's body is the row's body or one above it."""
+    """[nbody, nbody] True where the column's body is the row's body or one of its ancestors."""
     above = np.eye(model.nbody, dtype=bool)
     for body in range(1, model.nbody):
         above[body] |= above[model.body_parentid[body]]
@@ -228,7 +228,7 @@ def _body_invweight(model: Any, data: Any, inverse: jax.Array) -> jax.Array:
 
 
 def _dof_average(model: Any) -> np.ndarray:
-    """[nv, nv] averaging over the translations and over the rotations of free and ball joints."""
+    """[nv, nv] matrix that averages over the translations and over the rotations of free and ball joints."""
     blocks = np.zeros((model.nv, model.nv), dtype=np.float32)
     dof = 0
     for kind in model.jnt_type:
@@ -242,7 +242,7 @@ def _dof_average(model: Any) -> np.ndarray:
 
 
 def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
-    """The counterpart in C: a copy of the scene's MjModel with the values [D] applied and constants derived."""
+    """A copy of the scene's MjModel with the values [D] applied and constants derived."""
     model = copy.copy(scene.model)
     terms = nominal_field(model, PSEUDO_INERTIA)
     for column, write in model_writes(space):
@@ -266,24 +266,24 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     if (_SOURCES | _PLACES) & written:
         data = mujoco.MjData(model)
         mujoco.mj_setConst(model, data)
-        # mj_setConst leaves the statistics alone; the solver scales its tolerance with them.
+        # mj_setConst does not update the statistics, with which the solver scales its tolerance.
         model.stat.meaninertia = _inertia_of(model, data).mean()
         model.stat.meanmass = model.body_subtreemass[0] / (model.nbody - 1)
-    if (_PLACES | {"geom_size"}) & written:  # boxes around several geoms of a body stay as they were compiled
+    if (_PLACES | {"geom_size"}) & written:  # bounding boxes of several geoms are not updated
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         _bound(model, {w.index[0] for _, w in model_writes(space) if w.field == "geom_size"})
     return model
 
 
 def no_short_cut(model: mujoco.MjModel, bodies: Sequence[int]) -> None:
-    """Take from C what it may spare where a body's frame of inertia is the body's own, and its joints go through it."""
+    """Disable C MuJoCo's shortcuts for bodies whose inertial frame is the body frame or contains the joints."""
     if model.body_simple[bodies].any():
         model.dof_simplenum[:] = 0
     model.body_sameframe[bodies] = model.body_simple[bodies] = 0
 
 
 def _inertia_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """[nv] diagonal of the inertia matrix at qpos0, where mj_setConst left `data`, with armature of tendons."""
+    """[nv] diagonal of the inertia matrix in the pose of `data`, with the armature of tendons."""
     if not model.tendon_armature.any():
         return model.dof_M0
     full = np.zeros((model.nv, model.nv))
@@ -292,20 +292,20 @@ def _inertia_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def _bound(model: mujoco.MjModel, geoms: Iterable[int]) -> None:
-    """Write the radius and box around geoms of a primitive shape, as the compiler does; a mesh has no own size."""
+    """Update bounding radius and box of primitive geoms, as the compiler does; meshes are unchanged."""
     for geom in geoms:
         x, y, z = model.geom_size[geom]
-        around = {
+        bounds = {
             mujoco.mjtGeom.mjGEOM_SPHERE: ((x, x, x), x),
             mujoco.mjtGeom.mjGEOM_CAPSULE: ((x, x, x + y), x + y),
             mujoco.mjtGeom.mjGEOM_CYLINDER: ((x, x, y), np.hypot(x, y)),
             mujoco.mjtGeom.mjGEOM_ELLIPSOID: ((x, y, z), max(x, y, z)),
             mujoco.mjtGeom.mjGEOM_BOX: ((x, y, z), np.sqrt(x**2 + y**2 + z**2)),
         }.get(mujoco.mjtGeom(int(model.geom_type[geom])))
-        if around is not None:
-            model.geom_aabb[geom, 3:], model.geom_rbound[geom] = around
+        if bounds is not None:
+            model.geom_aabb[geom, 3:], model.geom_rbound[geom] = bounds
 
 
 def theta_of(space: Space, values: Any) -> dict[str, Any]:
-    """Name -> value, of values [D], for the parameters that live outside the model."""
+    """Name -> value, of a vector [D], for the parameters outside the model."""
     return {p.name: values[i] for i, p in enumerate(space.parameters) if not p.writes}

@@ -1,4 +1,4 @@
-"""mujoco.mjx as the package imports it: without the two lines that it prints where warp is not installed."""
+"""Import mujoco.mjx without the two lines that it prints if warp is not installed."""
 
 from droid_jax.quiet import import_mjx
 

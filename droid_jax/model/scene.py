@@ -1,7 +1,7 @@
-"""A scene: an MJCF compiled once, with its names turned into ids once.
+"""A scene: an MJCF compiled once, with its names resolved to ids once.
 
-`load_scene` takes a user's own MJCF, `door.scene.door_scene` composes the built-in one.  Replays use a
-model without the geoms of group 2 that touch nothing: they are only for the eye (their mass counts).
+`load_scene` reads a user's MJCF, `door.scene.door_scene` composes the built-in one.  Replays use a model without visual
+geoms (group 2, without collisions); their mass counts.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from droid_jax.model.unsupported_features import check_options, refuse_ignored, 
 from droid_jax.model.visual_geoms import compiled, visual_geoms, without_visual_geoms
 from droid_jax.runtime import first_device
 
-LONGEST = 900  # characters of what is wrong with a scene, lists of names among it
-PICTURE = (480, 640)  # height, width of the largest picture that is drawn
-TINY_FRICTIONLOSS = 1e-6  # N m: enough to give a joint its friction-loss row
-# MuJoCo's defaults of a joint's friction constraint, and the hardest impedance that there is (mjMAXIMP).
+LONGEST = 900  # most characters of an error message about a scene, which may list names
+PICTURE = (480, 640)  # height, width of the largest rendered picture
+TINY_FRICTIONLOSS = 1e-6  # N m, gives a joint a constraint row for dry friction
+# MuJoCo's defaults of a joint's friction constraint, and the largest impedance (mjMAXIMP).
 SOFT_REFERENCE, SOFT_IMPEDANCE = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
 HARD = 0.9999
 ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -35,9 +35,9 @@ ONE_DEGREE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 @dataclass(frozen=True, eq=False)
 class Grip:
-    """What holds the object: the contact pairs of each finger.
+    """The contact pairs of each finger of a hand that holds an object.
 
-    fingers: for each finger the names of its contact pairs; a finger touches when any of them does.
+    fingers: for each finger the names of its contact pairs; a finger touches if any of them does.
     """
 
     fingers: tuple[tuple[str, ...], ...]
@@ -49,16 +49,16 @@ class Scene:
 
     Attributes:
         name: for messages and reports.
-        spec: the MjSpec, visual geoms included; never changed after construction.
-        model: compiled without visual geoms; what is replayed.
+        spec: the MjSpec, with visual geoms; never changed after construction.
+        model: of replays, compiled without visual geoms.
         joints: servo-driven joints whose torque and position are measured, in channel order [J].
-        command_names: joints of the actuators, in actuator order [U]; of one that drives a tendon, or drives a joint
-            beside the joint's position servo, its own name.
-        object_joint: joint of the thing that is moved (the door's hinge), or None.
-        grip: how a lost grasp is seen, or None where there is nothing to grip.
-        path: of the MJCF that it was loaded from, or None where it was not a file alone.
-        held: joints whose dry friction holds still here, and creeps in the MJCF (`load_scene`).
-        hold: dry friction that an effect brings to a joint shall hold still too (`effects.registry.ready`).
+        command_names: joints of the actuators, in actuator order [U]; the actuator's name if it drives a tendon, or a
+            joint in addition to a position servo.
+        object_joint: joint of the object that is moved (the door's hinge), or None.
+        grip: contact pairs that show a lost grasp, or None without a hand.
+        path: of the MJCF; None if the scene is not from one file.
+        held: joints whose friction constraint is hard here and soft in the MJCF (`load_scene`).
+        hold: whether friction constraints that effects add are hard too (`effects.registry.ready`).
     """
 
     name: str
@@ -73,15 +73,15 @@ class Scene:
     hold: bool = False
 
     def id(self, kind: str, name: str) -> int:
-        """Id of a named thing; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
+        """Id of a named element; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
         return name_to_id(self.model, kind, name)
 
     def dof(self, joint: str) -> int:
-        """Address of a (one-degree) joint in velocity vectors."""
+        """Address of a hinge or slide in velocity vectors."""
         return int(self.model.jnt_dofadr[self.id("joint", joint)])
 
     def qpos(self, joint: str) -> int:
-        """Address of a (one-degree) joint in position vectors."""
+        """Address of a hinge or slide in position vectors."""
         return int(self.model.jnt_qposadr[self.id("joint", joint)])
 
     def slides(self, joint: str) -> bool:
@@ -89,11 +89,11 @@ class Scene:
         return bool(self.model.jnt_type[self.id("joint", joint)] == mujoco.mjtJoint.mjJNT_SLIDE)
 
     def torque_unit(self, joints: Iterable[str]) -> str:
-        """Of what joints are driven with: N m for hinges, N for slides, "N m or N" for both."""
+        """Unit of joint torques: N m for hinges, N for slides, "N m or N" for both."""
         return self._unit(joints, "N m", "N")
 
     def position_unit(self, joints: Iterable[str]) -> str:
-        """Of where joints are: rad for hinges, m for slides, "rad or m" for both."""
+        """Unit of joint positions: rad for hinges, m for slides, "rad or m" for both."""
         return self._unit(joints, "rad", "m")
 
     def _unit(self, joints: Iterable[str], hinge: str, slide: str) -> str:
@@ -112,20 +112,20 @@ class Scene:
 
     @functools.cached_property
     def single_joints(self) -> tuple[str, ...]:
-        """Names of all joints of one degree, driven or not, in the model's order."""
+        """Names of all hinges and slides, driven or not, in the model's order."""
         kinds = [mujoco.mjtJoint(k) for k in self.model.jnt_type]
         names = (mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(len(kinds)))
         return tuple(name for name, kind in zip(names, kinds, strict=True) if kind in ONE_DEGREE and name)
 
     def carriers(self, joints: Iterable[str]) -> tuple[str, ...]:
-        """Joints of one degree between the world and the bodies that these joints move, these included.
+        """Hinges and slides between the world and the bodies that these joints move, including these joints.
 
-        One without a name goes by its body's.
+        A joint without a name is described by its body's.
         """
         return tuple(self.joint_called(j) for j in self._above(joints) if self._is_single(j))
 
     def floating(self, joints: Iterable[str]) -> tuple[str, ...]:
-        """Joints of several degrees (free ones, balls) between the world and the bodies that these joints move."""
+        """Free and ball joints between the world and the bodies that these joints move."""
         return tuple(self.joint_called(j) for j in self.floating_ids(joints))
 
     def floating_ids(self, joints: Iterable[str]) -> tuple[int, ...]:
@@ -145,7 +145,7 @@ class Scene:
         return mujoco.mjtJoint(self.model.jnt_type[joint]) in ONE_DEGREE
 
     def joint_called(self, joint: int) -> str:
-        """A joint's name by its id; one without a name goes by its body's."""
+        """A joint's name by its id; a joint without a name is described by its body's."""
         name = mujoco.mj_id2name(self.model, mujoco.mjtObj.mjOBJ_JOINT, joint)
         return name or f"the joint of body {self.model.body(self.model.jnt_bodyid[joint]).name!r}"
 
@@ -157,48 +157,48 @@ class Scene:
 
     @functools.cached_property
     def of_joint(self) -> np.ndarray:
-        """[U] bool, whose entry of `command_names` is a joint."""
+        """[U] bool, actuators whose entry of `command_names` is a joint."""
         return of_joint(self.model, self.command_names)
 
     @functools.cached_property
     def driven_joints(self) -> tuple[str, ...]:
-        """Joints that an actuator of their own drives, in actuator order."""
+        """Joints in `command_names`, in actuator order."""
         return tuple(name for name, of in zip(self.command_names, self.of_joint, strict=True) if of)
 
     @property
     def finger_joints(self) -> tuple[str, ...]:
-        """The gripper's joints: driven, but not measured."""
+        """Joints that are driven, but not measured: those of the gripper."""
         return tuple(name for name in self.driven_joints if name not in self.joints)
 
     @functools.cached_property
     def mjx(self) -> Any:
-        """The mjx.Model on the default device; ValueError for a model that MJX has not everything for."""
+        """The mjx.Model on the default device; ValueError for a model that MJX does not support."""
         import jax
 
         from droid_jax.model.quiet_mjx import mjx
 
         _ = self._sha256_of_mjx
         try:
-            with jax.ensure_compile_time_eval():  # else a first use inside jit would keep that trace's values
+            with jax.ensure_compile_time_eval():  # a first use inside jit must not store that trace's values
                 put = cast(Callable[..., Any], mjx.put_model)  # pyright: ignore[reportUnknownMemberType]
                 return put(self.model, device=first_device())
         except NotImplementedError as error:
             raise ValueError(
-                f"scene {self.name!r} uses something that MJX has not: {error}; change it in the MJCF "
-                "(https://mujoco.readthedocs.io/en/stable/mjx.html#feature-parity lists what there is)"
+                f"scene {self.name!r} uses something that MJX does not support: {error}; change it in the MJCF "
+                "(https://mujoco.readthedocs.io/en/stable/mjx.html#feature-parity lists what it supports)"
             ) from None
 
     @functools.cached_property
     def _sha256_of_mjx(self) -> str:
-        """Hash of the model when `mjx` was made of it."""
+        """Hash of the model at the time when `mjx` was made of it."""
         return sha256_of(self.model)
 
     def check_unchanged(self) -> None:
-        """Raise ValueError where the model was changed after `mjx` was made of it: replays would mix both."""
+        """Raise ValueError if the model was changed after `mjx` was made of it, since replays would use both."""
         if "mjx" in vars(self) and self._sha256_of_mjx != sha256_of(self.model):
             raise ValueError(
                 f"the model of scene {self.name!r} was changed after it was compiled: load the scene again, or change "
-                "its options with droid_jax.model.scene.with_options, which makes another scene"
+                "its options with droid_jax.model.scene.with_options, which returns another scene"
             )
 
     @functools.cached_property
@@ -208,21 +208,21 @@ class Scene:
 
     @functools.cached_property
     def full_geom_ids(self) -> np.ndarray:
-        """[ngeom] the id that each geom of the model has where the looks are there too: in the MJCF as it was given."""
+        """[ngeom] the id of each geom of the model in the MJCF with visual geoms."""
         spec = self.spec.copy()
         compiled(spec)  # numbers the geoms
-        looks = {geom.id for geom in visual_geoms(spec)}
-        return np.array([geom.id for geom in spec.geoms if geom.id not in looks], dtype=int)
+        visual = {geom.id for geom in visual_geoms(spec)}
+        return np.array([geom.id for geom in spec.geoms if geom.id not in visual], dtype=int)
 
     def visual_model(self) -> mujoco.MjModel:
-        """The same scene with its looks, for rendering; pictures of the usual size fit its offscreen buffer."""
+        """The model with visual geoms, for rendering, with an offscreen buffer of at least PICTURE."""
         model = compiled(self.spec)
         buffer = model.vis.global_  # the MJCF may ask for a small one
         buffer.offheight, buffer.offwidth = np.maximum((buffer.offheight, buffer.offwidth), PICTURE)
         return model
 
     def initial_qpos(self, positions: dict[str, float] | Any) -> np.ndarray:
-        """[nq] the model's reference pose with named joints set; unknown names raise."""
+        """[nq] the model's reference pose with named joints set, rad and m; ValueError for unknown names."""
         qpos = self.model.qpos0.copy()
         for joint, value in positions.items():
             qpos[self.qpos(joint)] = value
@@ -230,19 +230,19 @@ class Scene:
 
     @property
     def needs_command(self) -> tuple[str, ...]:
-        """Those of `command_names` that a recording must command: measured joints, and where something is gripped all.
+        """Entries of `command_names` that a recording must command: measured joints, or all joints if there is a grip.
 
-        The others stay where the motion starts if it does not; so do those that drive a joint beside its servo.
+        Other actuators hold their start if the recording does not command them.
         """
-        beside = drives_joint(self.model) & ~self.of_joint
+        secondary = drives_joint(self.model) & ~self.of_joint  # drive a joint in addition to its servo
         gripped = self.grip is not None
-        names = zip(self.command_names, beside, strict=True)
+        names = zip(self.command_names, secondary, strict=True)
         return tuple(name for name, other in names if name in self.joints or (gripped and not other))
 
     def command_index(self, names: Sequence[str]) -> np.ndarray:
-        """[U] columns of `names` that feed this scene's actuators, in actuator order; -1 for one that has none there.
+        """[U] column of `names` for each actuator; -1 without one.
 
-        ValueError where one is missing that is needed.
+        Raises ValueError if a name of `needs_command` is missing.
         """
         missing = [n for n in self.needs_command if n not in names]
         if missing:
@@ -254,23 +254,23 @@ class Scene:
 
 
 def sha256_of(model: mujoco.MjModel) -> str:
-    """Hash of all that a model holds; a quarter of a millisecond for the door's."""
+    """Hash of a model's content; it takes a quarter of a millisecond for the door's."""
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return hashlib.sha256(content.tobytes()).hexdigest()
 
 
 def name_to_id(model: mujoco.MjModel, kind: str, name: str) -> int:
-    """Id of a named joint, body, geom, pair, actuator or site; an unknown name lists the valid ones."""
+    """Id of a named joint, body, geom, pair, actuator or site; ValueError for an unknown name lists the valid ones."""
     obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
     given: Any = name
     plain = isinstance(given, str) and bool(given) and given.isprintable()
-    found = mujoco.mj_name2id(model, obj, name) if plain else -1
-    if found < 0:
+    index = mujoco.mj_name2id(model, obj, name) if plain else -1
+    if index < 0:
         valid = [v for v in (mujoco.mj_id2name(model, obj, i) for i in range(_count(model, kind))) if v]
         has = f"has: {', '.join(valid)}" if valid else f"has no {kind} with a name"
         raise ValueError(f"unknown {kind} {arguments.shown(name)}; this scene {has}")
-    return found
+    return index
 
 
 def _count(model: mujoco.MjModel, kind: str) -> int:
@@ -297,14 +297,24 @@ def compile_scene(
 ) -> Scene:
     """Compile a spec into a Scene and check it.
 
-    joints: measured joints; default: every joint that a joint actuator drives.
-    unlimited: joints whose range is not enforced in the replay.  Every limited joint costs a
-      constraint row per step (a third of the time for the Panda), and a recording that keeps
-      inside its ranges never feels them; the servo's command range still holds.
-    engine, mj_step: of the replays.  "mujoco" lets pass what the C engine has and MJX has not (integrators, friction
-      cones, fluids, kinds of actuators and equalities); mj_step what MJX has in its own steps alone.
-    Raises ValueError for unknown names, for joints of several degrees of freedom, for
-    features that MJX would silently ignore, for plugins, and for what the replays have not.
+    Args:
+        spec: of the scene.
+        name: for messages and reports.
+        joints: measured joints; None: all joints that an actuator drives.
+        object_joint: joint of the object that is moved.
+        grip: contact pairs of a hand.
+        unlimited: joints whose range replays do not enforce.  Each limited joint costs a constraint row (a third of the
+            time for the Panda), which a recording inside the ranges does not need.  Command ranges still apply.
+        engine: of the replays.  "mujoco" allows features that C MuJoCo supports but MJX does not (integrators, friction
+            cones, fluids, types of actuators and equalities).
+        mj_step: whether replays use mj_step's own steps, which support elliptic cones and fluids.
+
+    Returns:
+        The compiled scene.
+
+    Raises:
+        ValueError: a name is unknown, a measured joint is no hinge or slide, or the model has features that MJX
+            silently ignores, plugins, or features that replays do not support.
     """
     arguments.one_of(engine, "engine", ("mjx", "mujoco"))
     joints = None if joints is None else arguments.names(joints, "joints")
@@ -313,7 +323,7 @@ def compile_scene(
     for joint in bare.joints:
         if joint.name in free:
             joint.limited = False
-    for joint in bare.joints:  # MJX lays friction-loss rows out at compilation: zero could never be raised
+    for joint in bare.joints:  # MJX lays constraint rows out at compilation, none for zero friction loss
         if joint.name == object_joint and joint.type in ONE_DEGREE and joint.frictionloss <= 0:
             joint.frictionloss = TINY_FRICTIONLOSS
     model = bare.compile()
@@ -336,7 +346,7 @@ def compile_scene(
         kind = mujoco.mjtJoint(model.jnt_type[scene.id("joint", joint)])
         if kind not in ONE_DEGREE:
             raise ValueError(f"joint {joint!r} of scene {name!r} must be a hinge or a slide")
-    _ = scene.finger_pairs  # unknown pair names fail here, not in the first replay
+    _ = scene.finger_pairs  # raises for unknown pair names
     return scene
 
 
@@ -351,17 +361,17 @@ def load_scene(
     engine: str = "mjx",
     mj_step: bool = False,
 ) -> Scene:
-    """A user's own MJCF as a Scene.
+    """Load a user's MJCF as a Scene.
 
     Args:
         path: of the MJCF.
         joints: measured joints, in channel order; None for all driven ones.
-        object_joint: joint of the thing that is moved, or None.
-        friction_joints: joints whose friction loss will be a parameter though the file gives none.
-        assets: contents of files that it names, by name, where they do not lie beside it: `env.model_assets` of
-            mujoco_playground. An MJCF that is written of the scene later names them as this one does.
-        hold: dry friction of joints holds still: their friction constraint is as hard as MuJoCo has it, unless the
-            MJCF sets its solver parameters itself (solimpfriction, solreffriction).
+        object_joint: joint of the object that is moved, or None.
+        friction_joints: joints whose friction loss will be a parameter, but is zero in the file.
+        assets: name -> content of files that the MJCF names but that are not beside it, such as `env.model_assets` of
+            mujoco_playground. An MJCF that is written later contains the same names.
+        hold: whether dry friction does not creep: friction constraints have MuJoCo's hardest impedance, unless the
+            MJCF sets their solver parameters (solimpfriction, solreffriction).
         engine, mj_step: as in `compile_scene`.
 
     Returns:
@@ -369,7 +379,7 @@ def load_scene(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file does not compile, names are unknown, or MJX would ignore something in it.
+        ValueError: the file does not compile, names are unknown, or MJX does not support or would ignore a feature.
     """
     path = arguments.path_of(path, "the path of an MJCF")
     friction_joints = arguments.names(friction_joints, "friction_joints")
@@ -401,7 +411,7 @@ def load_scene(
 
 
 def _hold(spec: mujoco.MjSpec) -> tuple[str, ...]:
-    """Make the dry friction of a spec's joints hard where nothing is said of its constraint; names of these joints."""
+    """Harden the friction constraints of a spec's joints that have default solver parameters; returns their names."""
     soft = [joint for joint in spec.joints if joint.frictionloss > 0 and is_soft(joint)]
     for joint in soft:
         joint.solimp_friction[:2] = HARD
@@ -409,22 +419,22 @@ def _hold(spec: mujoco.MjSpec) -> tuple[str, ...]:
 
 
 def is_soft(joint: Any) -> bool:
-    """Whether nothing is said of the friction constraint of a spec's joint: it is MuJoCo's default, which creeps."""
+    """Whether the friction constraint of a spec's joint has MuJoCo's default solver parameters, which creep."""
     default = np.allclose(joint.solref_friction, SOFT_REFERENCE)
     return bool(default and np.allclose(joint.solimp_friction, SOFT_IMPEDANCE))
 
 
 def _read(path: Path, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
-    """The spec of an MJCF, of whose included files, meshes and textures some are given."""
+    """The spec of an MJCF, with the content of some included files, meshes and textures given."""
     included = {name: content for name, content in assets.items() if name.endswith(".xml")}
     others = {name: content for name, content in assets.items() if name not in included}
     return mujoco.MjSpec.from_file(str(path), include=included, assets=others)
 
 
 def with_options(scene: Scene, **changes: Any) -> Scene:
-    """The same scene compiled with other options: timestep, integrator, cone, iterations, ls_iterations...
+    """A copy of the scene with other options of mujoco.MjOption (timestep, integrator, cone, iterations, ...).
 
-    Names are those of mujoco.MjOption, ValueError for others; the spec is not touched.
+    The spec is unchanged.  Raises ValueError for an unknown option or an invalid value.
     """
     model = scene.model.__copy__()
     for name, value in changes.items():

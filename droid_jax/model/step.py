@@ -1,13 +1,12 @@
-"""One simulation step of MJX with a constraint solver made for float32 and small batches of rows.
+"""One simulation step of MJX with a constraint solver for float32 and few constraint rows.
 
-mjx.step's Newton solver decides by differences of the cost, which float32 resolves to a relative
-1e-7; near the optimum the acceleration is then only right to about 1e-3 rad/s^2, always late in
-the same direction, and a sticking grasp creeps: 0.1 N m of joint torque at the end of a door
-opening.  `solve` here iterates on the gradient alone and agrees with the C engine (and with
-mjx.step in float64) to better than 0.01 N m over the same opening, and it is faster.
+mjx.step's Newton solver uses differences of the cost, which float32 resolves to a relative 1e-7.  Its accelerations are
+then exact to about 1e-3 rad/s^2, with an error of constant sign, so that a sticking grasp creeps: 0.1 N m of joint
+torque at the end of a door opening.  `solve` uses the gradient only.  It agrees with the C engine (and with mjx.step in
+float64) to 0.01 N m over the same opening, and it is faster.
 
-Pyramidal and frictionless contacts, limits, equalities and dry friction are solved here; a model
-with elliptic cones goes through mjx.solve.
+`solve` supports pyramidal and frictionless contacts, limits, equalities and dry friction.  Models with elliptic cones
+use mjx.solve.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ from droid_jax.model.normal_equations import normal_equations
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.unsupported_features import check_options
 
-ITERATIONS = 8  # at most; two or three are usual from a warm start
-LINE_SEARCH = 6  # corners of the piecewise linear slope followed in one step
-FIRM_LINE_SEARCH = 12  # the same where joint friction is firm: its part of the slope is steep and narrow
-EXACT_ROWS = 16  # constraint rows up to which all corners of firm friction are looked at at once, which is as cheap
-FIRM = 0.95  # impedance of a friction constraint above which it is
-_TOLERANCE = 3e-6  # of the acceleration's scale: what float32 can still tell apart
-_ROUNDING = 1e-5  # of a Newton step: how exactly float32 solves for it
+ITERATIONS = 8  # most Newton iterations; two or three are usual from a warm start
+LINE_SEARCH = 6  # iterations of a line search, each at a corner of the piecewise linear slope
+FIRM_LINE_SEARCH = 12  # the same for firm joint friction, whose part of the slope is steep and narrow
+EXACT_ROWS = 16  # constraint rows up to which all corners are evaluated at once for firm friction, at the same cost
+FIRM = 0.95  # impedance of a friction constraint above which it is firm
+_TOLERANCE = 3e-6  # relative change of the acceleration that float32 resolves
+_ROUNDING = 1e-5  # relative accuracy of a Newton step in float32
 
 
 def simulate_step(
@@ -53,16 +52,22 @@ def simulate_step(
     servo_damping: bool = True,
     push: Callable[[Any], jax.Array] | None = None,
 ) -> Any:
-    """Advance mjx.Data by one time step; integrators Euler and implicitfast.
+    """Advance mjx.Data by one time step, without sensors, cameras and lights.
 
-    parity=False: second order in the time step.  Positions belong to the time of the step,
-      velocities to half a step before (leapfrog); joint damping and constraint damping use the mean
-      velocity of the step, and constraints are solved with the inertia that follows, M + h/2 D.
-    parity=True: what C MuJoCo's implicitfast and Euler do, first order, for comparisons step by step.
-    servo_damping: False spares what only actuators with a velocity gain need (see `actuators.has_servo_damping`).
-    push: mjx.Data with the kinematics of the pose -> [nv] generalised forces, which take the place of qfrc_applied.
-    Leaves out what no replay reads: sensors, cameras, lights.
-    Raises ValueError for other integrators, and for elliptic cones, air and water unless parity.
+    Args:
+        model: mjx.Model with the integrator Euler or implicitfast.
+        data: mjx.Data.
+        parity: if False, the step is of second order.  Positions belong to the time of the step, velocities to half a
+            step before (leapfrog).  Joint damping and constraint damping use the mean velocity of the step, so
+            constraints are solved with the inertia M + h/2 D.  If True, the step is that of C MuJoCo, of first order.
+        servo_damping: False omits computations for actuators with a velocity gain (`actuators.has_servo_damping`).
+        push: mjx.Data with the kinematics of the pose -> [nv] generalised forces that replace qfrc_applied.
+
+    Returns:
+        mjx.Data after the step.
+
+    Raises:
+        ValueError: the model has another integrator, or elliptic cones or a fluid without `parity`.
     """
     check_options(model, parity)
     with exact_segments(), contextlib.nullcontext() if parity else midpoint_constraints():
@@ -75,7 +80,7 @@ def simulate_step(
     if np.any(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE):
         data = _within_range(model, data)
     if servo_damping:
-        model = _without_held(model, data, parity)
+        model = _without_saturated(model, data, parity)
     if not parity:
         slope = mjx.deriv_smooth_vel(model, data)
         inertia = inertia if slope is None else inertia - 0.5 * model.opt.timestep * slope
@@ -89,58 +94,60 @@ def simulate_step(
         return mjx.euler(_undamped(model), data)
     if not _is_euler(model):
         return mjx.implicit(model, data)
-    without = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_DAMPER  # which mjx.euler does not look at
-    return mjx.euler(_undamped(model) if without else model, data)
+    undamped = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_DAMPER  # mjx.euler ignores this flag
+    return mjx.euler(_undamped(model) if undamped else model, data)
 
 
 def servo_force(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
-    """[nv] N m, the actuators' forces of the step that `data` comes from, had the joints moved at velocity [nv].
+    """[nv] N m, the actuators' forces in the step that gave `data`, at joint velocities [nv].
 
-    A step integrates velocity gains at its mean velocity, data.qfrc_actuator is at the one before it.
+    A step integrates velocity gains at its mean velocity; data.qfrc_actuator is that at the velocity before the step.
     """
     return mjx.fwd_actuation(model, at_velocity(data, velocity)).qfrc_actuator
 
 
 def gear_torques(model: Any, data: Any, velocity: jax.Array) -> jax.Array:
-    """[2, nv] N m, of the step that `data` comes from: what motors give to the gears, what the links put onto them.
+    """[2, nv] N m, torques of the motors and of the links on the gears, in the step that gave `data`.
 
-    Motors: actuators and what compensates gravity.  Links: weight, the motion of the others, springs, contacts, limits
-    and applied forces; all but the joints' own inertia, damping and dry friction.  velocity: [nv] before the step.
+    Motors: actuators and gravity compensation.  Links: weight, velocity terms, springs, contacts, limits and applied
+    forces, without the joints' inertia, damping and dry friction.
+
+    velocity: [nv] before the step.
     """
     rows = constraint_rows(data)
     dry = slice(rows.equalities, rows.equalities + rows.frictions)
-    held = data.qfrc_constraint - rows.jacobian[dry].T @ rows.force[dry]
+    constraints = data.qfrc_constraint - rows.jacobian[dry].T @ rows.force[dry]
     compensated = (1.0 - model.jnt_actgravcomp[model.dof_jntid]) * data.qfrc_gravcomp
-    links = data.qfrc_passive - compensated - data.qfrc_bias + held + data.qfrc_applied
+    links = data.qfrc_passive - compensated - data.qfrc_bias + constraints + data.qfrc_applied
     if not model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         links = links + model.dof_damping * velocity
     return jnp.stack([data.qfrc_actuator + compensated, links])
 
 
 def _within_range(model: Any, data: Any) -> Any:
-    """The data with controls inside their ranges, as the forces took them: mjx's derivative of a damper does not."""
+    """The data with clipped controls, which mjx's derivative of a damper does not clip."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         return data
     low, high = model.actuator_ctrlrange.T
     return data.replace(ctrl=jnp.where(model.actuator_ctrllimited, jnp.clip(data.ctrl, low, high), data.ctrl))
 
 
-def _without_held(model: Any, data: Any, parity: bool) -> Any:
-    """The model without the velocity gains of servos whose force a limit holds: mjx's derivative counts them too."""
-    free = ~_held(model, data, parity)[:, None]
+def _without_saturated(model: Any, data: Any, parity: bool) -> Any:
+    """The model without velocity gains of servos at a force limit, which mjx's derivative would include."""
+    free = ~_saturated(model, data, parity)[:, None]
     gains = ("actuator_biasprm", "actuator_gainprm")
     return model.replace(**{g: jnp.where(free, getattr(model, g), getattr(model, g).at[:, 2].set(0.0)) for g in gains})
 
 
-def _held(model: Any, data: Any, parity: bool) -> jax.Array:
-    """[nu] bool, actuators of joints at their own force limit or (the C engine looks past it) at their joint's."""
-    held = model.actuator_forcelimited & _outside(data.actuator_force, model.actuator_forcerange)
+def _saturated(model: Any, data: Any, parity: bool) -> jax.Array:
+    """[nu] bool, actuators at their force limit, or at that of their joint, which the C engine ignores here."""
+    saturated = model.actuator_forcelimited & _outside(data.actuator_force, model.actuator_forcerange)
     if parity:
-        return held
+        return saturated
     of_joint = drives_joint(model)
-    joint = np.where(of_joint, model.actuator_trnid[:, 0], 0)  # a tendon's number is no joint's
+    joint = np.where(of_joint, model.actuator_trnid[:, 0], 0)  # the id of a tendon is no joint's
     torque = data.qfrc_actuator[model.jnt_dofadr[joint]]
-    return held | (of_joint & model.jnt_actfrclimited[joint] & _outside(torque, model.jnt_actfrcrange[joint]))
+    return saturated | (of_joint & model.jnt_actfrclimited[joint] & _outside(torque, model.jnt_actfrcrange[joint]))
 
 
 def _outside(values: jax.Array, bounds: jax.Array) -> jax.Array:
@@ -153,25 +160,33 @@ def _is_euler(model: Any) -> bool:
 
 
 def _undamped(model: Any) -> Any:
-    """The model with Euler's own implicit damping off: the acceleration already contains it."""
+    """The model without the implicit damping of Euler, since the acceleration contains it already."""
     flags = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     return model.replace(opt=model.opt.replace(disableflags=flags))
 
 
 def _may_be_firm(model: Any) -> bool:
-    """Whether a joint's friction is firm, or may be because its impedance is a parameter."""
+    """Whether a joint's friction is firm, or its impedance is a parameter."""
     if isinstance(model.dof_solimp, Tracer):
         return True
     return bool(np.any(np.asarray(model.dof_solimp)[np.asarray(friction_dofs(model)), 0] > FIRM))
 
 
 def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
-    """Newton's method on the primal problem of MuJoCo's solver, from the warm start.
+    """Solve the primal problem of MuJoCo's constraint solver by Newton's method, from the warm start.
 
-    min over a: a^T M a / 2 - a^T f + sum_i s_i(J_i a - aref_i), with the smooth forces f and s_i
-    quadratic while a row is active (equality: always; dry friction: inside its bounds; the rest:
-    while negative).  inertia: [nv, nv] M, or what the integrator will use in its place.  firm: whether joint friction
-    may be: the search along a step must not end early then, what is missing to its end adds up to milliradians.
+    min over a: a^T M a / 2 - a^T f + sum_i s_i(J_i a - aref_i), with the smooth forces f.  s_i is quadratic while a row
+    is active: equalities always, dry friction inside its bounds, other rows while negative.
+
+    Args:
+        inertia: [nv, nv] M, or the matrix that the integrator uses in its place.
+        data: mjx.Data after the smooth accelerations.
+        firm: whether joint friction may be firm.  Line searches are then exact, since an early end of them adds up to
+            errors of milliradians.
+
+    Returns:
+        mjx.Data with accelerations and constraint forces.
+
     Source: MuJoCo documentation, "Computation", section "Solver" (primal problem).
     """
     rows = constraint_rows(data)
@@ -199,11 +214,11 @@ def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
             share = _line_search(forces, residual, along, *slopes, FIRM_LINE_SEARCH if firm else LINE_SEARCH)
         qacc, residual = qacc + share * change, residual + share * along
         force, new_curvature = forces(residual)
-        # What is left of the way: all of it, but where no row changed sides the problem was quadratic
-        # and the share missing to a full step is left, or what the factorisation rounds off.
+        # Bound of the remaining error: the whole step.  If no row changed its state, the problem was quadratic and the
+        # error is the missing share of a full step, or the rounding of the factorisation.
         unchanged = jnp.all(new_curvature == curvature)
-        left = jnp.where(unchanged, jnp.maximum(jnp.abs(share - 1.0), _ROUNDING), 1.0) * jnp.max(jnp.abs(change))
-        moved = left > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
+        error = jnp.where(unchanged, jnp.maximum(jnp.abs(share - 1.0), _ROUNDING), 1.0) * jnp.max(jnp.abs(change))
+        moved = error > _TOLERANCE * (1.0 + jnp.max(jnp.abs(qacc)))
         return qacc, residual, force, new_curvature, count + 1, moved
 
     def unfinished(carry):
@@ -216,8 +231,8 @@ def solve(inertia: jax.Array, data: Any, firm: bool = False) -> Any:
     return with_constraint_force(data, force)
 
 
-# Sums of products in place of small matrix products: XLA fuses them with what stands beside them,
-# where each `dot` of a batch would be a call of its own.
+# Sums of products in place of small matrix products.  XLA fuses them with neighbouring operations, whereas each `dot`
+# of a batch would be a separate library call.
 def _times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.sum(matrix * vector, axis=-1)
 
@@ -227,7 +242,7 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def _force_bounds(rows: ConstraintRows) -> tuple[jax.Array, jax.Array]:
-    """[rows] the range of each row's force: any (equality), +- friction loss, or pushing only."""
+    """[rows] lower and upper bounds of forces: none (equalities), +- friction loss, or not negative."""
     kind = np.arange(rows.weight.shape[0])
     after = rows.equalities + rows.frictions
     equality, dry = kind < rows.equalities, (kind >= rows.equalities) & (kind < after)
@@ -244,10 +259,10 @@ def _line_search(
     quadratic: jax.Array,
     corners: int,
 ) -> jax.Array:
-    """Root of the cost's slope along a step: Newton's method on the share taken, kept in a bracket.
+    """The share of a step at which the cost's slope is zero, by Newton's method in a bracket.
 
-    The slope at share t is linear + t * quadratic - forces(residual + t * along) . along; it rises
-    with t (the cost is convex) and is piecewise linear, so Newton ends after a few corners.
+    The slope at share t is linear + t * quadratic - forces(residual + t * along) . along.  It increases with t (the
+    cost is convex) and is piecewise linear, so Newton's method ends after a few corners.
     """
     low: jax.Array = jnp.zeros(())
     high: jax.Array = jnp.full((), jnp.inf)
@@ -258,7 +273,7 @@ def _line_search(
         low, high = jnp.where(slope < 0, share, low), jnp.where(slope < 0, high, share)
         newton = share - slope / (quadratic + _dot(curvature, along * along) + 1e-30)
         middle = jnp.where(jnp.isinf(high), 2.0 * low, 0.5 * (low + high))
-        # Where Newton stands still it has arrived; bisecting there would lose the root again.
+        # Newton's method has converged if the share does not change; a bisection would lose the root.
         inside = (newton > low) & (newton < high) | (newton == share)
         share = jnp.where(inside, newton, middle)
     return share
@@ -272,9 +287,9 @@ def _exact_share(
     quadratic: jax.Array,
     ends: jax.Array,
 ) -> jax.Array:
-    """The same root by the slope at all of its corners at once: between two neighbours it is linear.
+    """The same root from the slopes at all corners at once; between two corners the slope is linear.
 
-    ends: [2, rows] of J a - aref, where each row's force reaches its bounds.
+    ends: [2, rows] values of J a - aref at which each row's force reaches its bounds.
     """
     moves = along != 0.0
     at = (ends - residual) / jnp.where(moves, along, 1.0)

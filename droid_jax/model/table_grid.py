@@ -1,4 +1,4 @@
-"""A function of a few variables as a table: where its nodes lie, and how far straight lines between them miss it."""
+"""Tables of a function of a few variables: adaptive nodes, and the error of linear interpolation between them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import numpy as np
 import scipy
 
 Function = Callable[[np.ndarray], np.ndarray]  # [K, axes] -> [K]
-FINE, COARSE = 1e-3, 5e-3  # of the function: error between nodes of variables, and of parameters
-SMALL = 0.02  # of its largest value: what is smaller counts as this
-ROUNDING = 1e-5  # what float32 leaves of a friction
-MOST, MOST_BESIDE, MOST_SHAPES = 2500, 300, 17  # nodes of a variable, of one beside another, of a parameter
-WITHIN = (0.5, 0.3)  # of the way to the next node, where lines are compared: the middle alone may be a ripple's zero
+FINE, COARSE = 1e-3, 5e-3  # relative interpolation error between nodes of variables, and of parameters
+LEAST_VALUE = 0.02  # of the largest value, least value to which an error is relative
+ROUNDING = 1e-5  # N m, rounding of a friction in float32
+# Most nodes of a single variable, of one of several variables, and of a parameter.
+MOST_SINGLE, MOST_OF_SEVERAL, MOST_SHAPES = 2500, 300, 17
+WITHIN = (0.5, 0.3)  # shares of the way between nodes at which errors are tested; a ripple may vanish in the middle
 
 
 @dataclass(frozen=True)
 class GridAxis:
-    """nodes: [N] ascending, of a variable, or of a parameter whose fitted value is among them."""
+    """An axis of a table: a variable or a parameter; nodes [N] are ascending and contain the fitted value."""
 
     name: str
     unit: str
@@ -27,19 +28,19 @@ class GridAxis:
 
 
 def first_nodes(low: float, high: float) -> np.ndarray:
-    """Even ones, and closer ones about zero, where laws have their corners."""
-    near = np.geomspace(1e-5, 1.0, 16) * max(abs(low), abs(high))
-    close = np.concatenate([-near, [0.0], near])
-    return np.unique(np.concatenate([np.linspace(low, high, 33), close[(close > low) & (close < high)]]))
+    """Evenly spaced nodes, and denser ones about zero, where laws have corners."""
+    distances = np.geomspace(1e-5, 1.0, 16) * max(abs(low), abs(high))
+    dense = np.concatenate([-distances, [0.0], distances])
+    return np.unique(np.concatenate([np.linspace(low, high, 33), dense[(dense > low) & (dense < high)]]))
 
 
 def refined(axes: Sequence[GridAxis], functions: Sequence[Function], fitted: Sequence[float]) -> list[GridAxis]:
-    """Axes with nodes put in where straight lines between them miss one of the functions.
+    """Axes with nodes inserted where linear interpolation of one of the functions is too inaccurate.
 
-    fitted: values of the parameters, which are the first axes; variables are refined at these.
+    fitted: values of the parameters, which are the first axes.  Variables are refined at these values.
     """
     out, shapes = list(axes), len(fitted)
-    variable = MOST if len(axes) - shapes == 1 else MOST_BESIDE
+    variable = MOST_SINGLE if len(axes) - shapes == 1 else MOST_OF_SEVERAL
     for k in (*range(shapes, len(axes)), *range(shapes)):
         most, slack = (MOST_SHAPES, COARSE) if k < shapes else (variable, FINE)
         others = [
@@ -58,32 +59,32 @@ def refined(axes: Sequence[GridAxis], functions: Sequence[Function], fitted: Seq
 
 
 def _split(nodes: np.ndarray, along: Function, most: int, slack: float) -> np.ndarray:
-    """Nodes and middles between them, until no line misses by more than a share of what is there."""
+    """Insert nodes in the middle of cells until the relative interpolation error is at most `slack`."""
     largest = float(np.abs(along(nodes)).max())
     while 1 < len(nodes) < most:
-        at, missed = along(nodes), np.zeros(len(nodes) - 1)
+        at, error = along(nodes), np.zeros(len(nodes) - 1)  # error: of each cell, 1 is allowed
         for share in WITHIN:
-            there = along((1.0 - share) * nodes[:-1] + share * nodes[1:])
-            allowed = slack * (np.abs(there) + SMALL * largest) + ROUNDING
+            exact = along((1.0 - share) * nodes[:-1] + share * nodes[1:])
+            allowed = slack * (np.abs(exact) + LEAST_VALUE * largest) + ROUNDING
             line = (1.0 - share) * at[:-1] + share * at[1:]
-            missed = np.maximum(missed, (np.abs(there - line) / allowed).max(axis=1))
+            error = np.maximum(error, (np.abs(exact - line) / allowed).max(axis=1))
         middle = 0.5 * (nodes[1:] + nodes[:-1])
-        bad = np.flatnonzero((missed > 1.0) & (np.diff(nodes) > 1e-7 * np.ptp(nodes)))
+        bad = np.flatnonzero((error > 1.0) & (np.diff(nodes) > 1e-7 * np.ptp(nodes)))
         if not bad.size:
             break
-        worst = bad[np.argsort(missed[bad])[::-1][: most - len(nodes)]]
+        worst = bad[np.argsort(error[bad])[::-1][: most - len(nodes)]]
         nodes = np.unique(np.concatenate([nodes, middle[worst]]))
     return nodes
 
 
 def on_grid(axes: Sequence[GridAxis], function: Function) -> np.ndarray:
-    """A function on the nodes of all axes."""
+    """Values of a function at the nodes of all axes."""
     grid = np.stack(np.meshgrid(*(a.nodes for a in axes), indexing="ij"), axis=-1).reshape(-1, len(axes))
     return function(grid).reshape([len(a.nodes) for a in axes])
 
 
 def differences(axes: Sequence[GridAxis], function: Function, table: np.ndarray, points: int = 4000) -> np.ndarray:
-    """[points] difference between a table and its function, at points in random cells."""
+    """[points] absolute interpolation errors of a table at random points of random cells."""
     rng, x = np.random.default_rng(0), np.empty((points, len(axes)))
     for i, axis in enumerate(axes):
         cell = rng.integers(max(len(axis.nodes) - 1, 1), size=points)

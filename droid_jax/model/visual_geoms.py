@@ -1,4 +1,4 @@
-"""What a scene has only for the eye, and how to leave it out: the bodies weigh what they weighed with it."""
+"""Visual geoms of a scene, and their removal without a change of the bodies' inertias."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-LOOK_GROUP = 2
+LOOK_GROUP = 2  # MuJoCo's group of visual geoms
 
 
 def visual_geoms(spec: mujoco.MjSpec) -> list[Any]:
-    """The geoms for the eye: of LOOK_GROUP, nothing can touch them, and no pair, tendon or sensor names them."""
+    """The geoms of LOOK_GROUP that cannot collide and that no pair, tendon or sensor names."""
     used = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     used |= {w.target.name for t in spec.tendons for w in t.path if isinstance(w.target, mujoco.MjsGeom)}
     for s in spec.sensors:
@@ -26,28 +26,28 @@ def visual_geoms(spec: mujoco.MjSpec) -> list[Any]:
 
 
 def without_visual_geoms(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """A copy without `visual_geoms`, whose bodies weigh what they weighed with them."""
+    """A copy of a spec without `visual_geoms`, with unchanged inertias of its bodies."""
     bare = spec.copy()
-    looks = visual_geoms(bare)
-    if looks:
-        whole = compiled(bare)
-        _weigh_emptied(bare, whole, {geom.id for geom in looks})
-        for geom in looks:
+    visual = visual_geoms(bare)
+    if visual:
+        complete = compiled(bare)
+        _state_emptied(bare, complete, {geom.id for geom in visual})
+        for geom in visual:
             bare.delete(geom)
-        keep_inertia(bare, whole)
+        keep_inertia(bare, complete)
     return bare
 
 
-def _weigh_emptied(spec: mujoco.MjSpec, model: mujoco.MjModel, looks: set[int]) -> None:
-    """Weigh the bodies that have their mass of looks alone: without them the spec would not compile."""
-    emptied = [b.id for b in spec.bodies[1:] if b.geoms and all(g.id in looks for g in b.geoms)]
+def _state_emptied(spec: mujoco.MjSpec, model: mujoco.MjModel, visual: set[int]) -> None:
+    """State the inertias of bodies whose mass comes from visual geoms only; else the spec would not compile."""
+    emptied = [b.id for b in spec.bodies[1:] if b.geoms and all(g.id in visual for g in b.geoms)]
     chosen = np.zeros(model.nbody, dtype=bool)
     chosen[emptied] = model.body_mass[emptied] > 0
-    _weigh_chosen(spec, model, chosen)
+    _state_chosen(spec, model, chosen)
 
 
-def _weigh_chosen(spec: mujoco.MjSpec, model: mujoco.MjModel, chosen: np.ndarray) -> None:
-    """Weigh the chosen bodies [nbody]; where what a body says of itself counts for nothing, all, so that it counts."""
+def _state_chosen(spec: mujoco.MjSpec, model: mujoco.MjModel, chosen: np.ndarray) -> None:
+    """State the inertias of the chosen bodies [nbody]; of all if the compiler ignores stated ones (inertiafromgeom)."""
     if not chosen.any():
         return
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
@@ -55,34 +55,34 @@ def _weigh_chosen(spec: mujoco.MjSpec, model: mujoco.MjModel, chosen: np.ndarray
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for body in spec.bodies[1:]:
         if chosen[body.id]:
-            weigh(body, model, body.id)
+            state_inertia(body, model, body.id)
 
 
 def keep_inertia(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Have every body of a spec weigh what it weighs in `model` (of the same bodies), whatever its geoms would give."""
-    now = compiled(spec)  # numbers the bodies, of which not all need a name
+    """State inertias in a spec so that all its bodies have those of `model`, a model of the same bodies."""
+    now = compiled(spec)  # also numbers the bodies
     fields = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
     same = np.all([_rows_close(getattr(now, f), getattr(model, f)) for f in fields], axis=0)
-    _weigh_chosen(spec, model, ~same & (model.body_mass > 0))
+    _state_chosen(spec, model, ~same & (model.body_mass > 0))
 
 
 def _rows_close(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n] bool, rows equal to rounding."""
+    """[n] bool, rows that are equal up to rounding."""
     close = np.isclose(a, b, rtol=1e-9, atol=1e-14)
     return np.all(np.reshape(close, (len(a), -1)), axis=1)
 
 
-def weigh(body: Any, model: mujoco.MjModel, index: int) -> None:
-    """Mass, centre and inertia of a body, its own and not its geoms'."""
+def state_inertia(body: Any, model: mujoco.MjModel, index: int) -> None:
+    """State mass, centre of mass and inertia of a body of a spec, in place of those of its geoms."""
     body.explicitinertial = True
     body.mass = float(model.body_mass[index])
     body.ipos, body.iquat = model.body_ipos[index].tolist(), model.body_iquat[index].tolist()
-    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # of several ways to say how the inertia is turned
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # no other attribute states the orientation
     body.inertia, body.fullinertia = model.body_inertia[index].tolist(), [np.nan] * 6
 
 
 def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a spec, without MuJoCo's warning of attached files that share a default (see door_scene._attach)."""
+    """The compiled model of a spec, without MuJoCo's warning about attached files that share a default class."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return spec.compile()

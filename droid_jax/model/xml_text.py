@@ -1,7 +1,7 @@
-"""An MJCF as its author wrote it: every start tag with its place in its file, included files among them.
+"""The text of an MJCF with the position of every start tag, also in included files.
 
-`read_tree` gives the tags as a tree in which an include stands for what it includes.  `with_edits` puts new attribute
-values into the text and leaves all else as it is: layout, comments, the order of attributes.
+`read_tree` gives the tags as a tree, with includes replaced by their content.  `with_edits` changes attributes in the
+text.  Layout, comments and the order of attributes are unchanged.
 """
 
 from __future__ import annotations
@@ -20,8 +20,15 @@ _ATTRIBUTE = re.compile(rb"""(\s+)([^\s=]+)(\s*=\s*)("[^"]*"|'[^']*')""")
 class Tag:
     """A start tag.
 
-    file: where it stands.  line: from 1.  start, end: bytes in the file, `end` behind its ">".  attributes: as written.
-    parent: the tag around it; of an included one that around the include.  empty: it closes itself.
+    Attributes:
+        name: of the element.
+        attributes: as written.
+        file: that contains it.
+        line: number, from 1.
+        start, end: byte positions in the file; `end` is after its ">".
+        empty: whether it closes itself.
+        parent: the enclosing tag; for an included tag the one that encloses the include.
+        children: tags inside it.
     """
 
     name: str
@@ -35,13 +42,13 @@ class Tag:
     children: list[Tag] = field(default_factory=list["Tag"])
 
     def walk(self) -> Iterator[Tag]:
-        """It and all below, in the order of the file."""
+        """Yield the tag and all tags inside it, in the order of the file."""
         yield self
         for child in self.children:
             yield from child.walk()
 
     def within(self) -> Iterator[Tag]:
-        """The tags around it, from the nearest on."""
+        """Yield the enclosing tags, from the innermost."""
         tag = self.parent
         while tag is not None:
             yield tag
@@ -50,8 +57,13 @@ class Tag:
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """root: of the main file.  texts: content of every file.  includes: the tags <include>, which the tree is without,
-    and the file that each names."""
+    """The tags of an MJCF and its includes.
+
+    Attributes:
+        root: of the main file.
+        texts: content of each file.
+        includes: <include> tags, which are not in the tree, and the files that they name.
+    """
 
     root: Tag
     texts: Mapping[Path, bytes]
@@ -59,14 +71,14 @@ class Tree:
 
 
 def read_tree(path: Path) -> Tree:
-    """The tags of an MJCF and of what it includes.
+    """The tags of an MJCF and of the files that it includes.
 
     Raises:
         ValueError: a file is missing, is no XML in UTF-8, or includes itself.
     """
     texts: dict[Path, bytes] = {}
     includes: list[tuple[Tag, Path]] = []
-    root = _read(path.resolve(), path.resolve().parent, texts)
+    root = _read(path.resolve(), texts)
 
     def expand(tag: Tag) -> None:
         children: list[Tag] = []
@@ -76,12 +88,12 @@ def read_tree(path: Path) -> Tree:
                 children.append(child)
                 continue
             named = child.attributes.get("file", "")
-            beside = [folder / named for folder in (path.resolve().parent, child.file.parent)]
-            found = next((p.resolve() for p in beside if p.is_file()), None)
-            if found is None or found in texts:
-                raise ValueError(f"{child.file}, line {child.line}: {named!r} is {'twice' if found else 'not'} there")
-            includes.append((child, found))
-            inner = _read(found, path.resolve().parent, texts)
+            candidates = [folder / named for folder in (path.resolve().parent, child.file.parent)]
+            file = next((p.resolve() for p in candidates if p.is_file()), None)
+            if file is None or file in texts:
+                raise ValueError(f"{child.file}, line {child.line}: {named!r} is {'twice' if file else 'not'} there")
+            includes.append((child, file))
+            inner = _read(file, texts)
             expand(inner)
             for each in inner.children:
                 each.parent = tag
@@ -92,8 +104,8 @@ def read_tree(path: Path) -> Tree:
     return Tree(root, texts, tuple(includes))
 
 
-def _read(path: Path, main: Path, texts: dict[Path, bytes]) -> Tag:
-    """The root of one file, includes as they stand."""
+def _read(path: Path, texts: dict[Path, bytes]) -> Tag:
+    """The root of one file, with its includes unresolved; adds the file's content to `texts`."""
     text = path.read_bytes()
     try:
         text.decode("utf-8-sig")
@@ -112,7 +124,7 @@ def _parse(path: Path, text: bytes) -> Tag:
         at = parser.CurrentByteIndex
         match = _TAG.match(text, at)
         if match is None:
-            raise ValueError(f"{path}, line {parser.CurrentLineNumber}: <{name}> is written in a way not known here")
+            raise ValueError(f"{path}, line {parser.CurrentLineNumber}: the text of <{name}> is not understood")
         tag = Tag(name, attributes, path, parser.CurrentLineNumber, at, match.end(), bool(match[3]))
         if stack:
             tag.parent = stack[-1]
@@ -129,23 +141,23 @@ def _parse(path: Path, text: bytes) -> Tag:
     return roots[0]
 
 
-Edits = Mapping[Tag, Mapping[str, str | None]]  # new attribute values; None takes the attribute away
+Edits = Mapping[Tag, Mapping[str, str | None]]  # new attribute values; None removes the attribute
 
 
 def with_edits(tree: Tree, edits: Edits, inserted: Mapping[Tag, str]) -> dict[Path, str]:
-    """The texts of the files that differ from the tree's: attributes changed, and lines put in behind start tags."""
+    """File -> new text, of the files that change; attributes are edited, and lines inserted after start tags."""
     replaced: dict[Path, list[tuple[int, int, bytes]]] = {}
     for tag, changes in edits.items():
         new = _with_attributes(tree.texts[tag.file][tag.start : tag.end], changes)
         replaced.setdefault(tag.file, []).append((tag.start, tag.end, new))
     for tag, line in inserted.items():
         text = tree.texts[tag.file]
-        own = text[text.rfind(b"\n", 0, tag.start) + 1 : tag.start]
+        of_tag = text[text.rfind(b"\n", 0, tag.start) + 1 : tag.start]
         first = next((c for c in tag.children if c.file == tag.file), None)
-        before = b"" if first is None else text[text.rfind(b"\n", 0, first.start) + 1 : first.start]
-        indent = before if before and not before.strip() else (own if not own.strip() else b"") + b"  "
-        alone = text[tag.end :].lstrip(b" \t")[:1] in (b"\n", b"\r")
-        new = b"\n" + indent + line.encode() + (b"" if alone else b"\n" + indent)
+        of_child = b"" if first is None else text[text.rfind(b"\n", 0, first.start) + 1 : first.start]
+        indent = of_child if of_child and not of_child.strip() else (of_tag if not of_tag.strip() else b"") + b"  "
+        ends_line = text[tag.end :].lstrip(b" \t")[:1] in (b"\n", b"\r")
+        new = b"\n" + indent + line.encode() + (b"" if ends_line else b"\n" + indent)
         replaced.setdefault(tag.file, []).append((tag.end, tag.end, new))
     out: dict[Path, str] = {}
     for file, changes in replaced.items():
@@ -158,19 +170,19 @@ def with_edits(tree: Tree, edits: Edits, inserted: Mapping[Tag, str]) -> dict[Pa
 
 
 def _with_attributes(tag: bytes, changes: Mapping[str, str | None]) -> bytes:
-    """A start tag with attributes replaced where they stand, taken away, or put behind the last one."""
-    left = dict(changes)
+    """A start tag with attributes replaced, removed, or added after the last one."""
+    remaining = dict(changes)
 
     def attribute(match: re.Match[bytes]) -> bytes:
         name = match[2].decode()
-        if name not in left:
+        if name not in remaining:
             return match[0]
-        value = left.pop(name)
+        value = remaining.pop(name)
         quote = match[4][:1]
         return b"" if value is None else match[1] + match[2] + match[3] + quote + value.encode() + quote
 
-    whole = _TAG.match(tag)
-    assert whole is not None
-    middle = _ATTRIBUTE.sub(attribute, whole[2])
-    middle += b"".join(f' {name}="{value}"'.encode() for name, value in left.items() if value is not None)
-    return tag[: whole.start(2)] + middle + tag[whole.end(2) :]
+    match = _TAG.match(tag)
+    assert match is not None
+    middle = _ATTRIBUTE.sub(attribute, match[2])
+    middle += b"".join(f' {name}="{value}"'.encode() for name, value in remaining.items() if value is not None)
+    return tag[: match.start(2)] + middle + tag[match.end(2) :]

@@ -1,6 +1,6 @@
-"""A trained policy on a robot: policy file, observation, control loop.  Needs numpy and nothing else.
+"""Run a trained policy on a robot: policy file, observation, control loop.  It needs numpy only.
 
-`python -m droid_jax.run export` puts a copy of this file beside the policy's; on the robot's computer:
+`python -m droid_jax.run export` copies this file to the policy's folder.  On the robot's computer:
 
     import control
 
@@ -38,23 +38,30 @@ SHAPES: dict[str, tuple[int, ...]] = {  # of an `Interface`
     "stiffness": (ARM,), "damping": (ARM,), "workspace": (2, 3), "chain": (ARM + 1, 4, 4), "pads": (FINGERS, 3),
     "slides": (FINGERS, 3), "start": (ARM + FINGERS,), "knob": (4, 4),
 }  # fmt: skip
-MOST_ARRAYS, MOST_BYTES, MOST_HEAD = 100, 64 * 2**20, 4096  # of a policy's file, and of one array's head
-POSITIVE = ("period", "reach", "width", "speed", "effort", "stiffness")  # of these
+MOST_ARRAYS, MOST_BYTES, MOST_HEAD = 100, 64 * 2**20, 4096  # limits of a policy's file, and of an array's header
+POSITIVE = ("period", "reach", "width", "speed", "effort", "stiffness")  # fields that must be above zero
 
 
 @dataclass(frozen=True, eq=False)
 class Interface:
-    """What a policy and its robot must agree on, taken from the scene that the policy was trained in.
+    """The properties on which a policy and its robot must agree, from the scene of the training.
 
-    period: s between actions.  reach: rad by which an action of one moves a joint's target from where the joint is;
-    width: m, finger command of an action of one (of minus one: shut).
-    ranges: [7, 2] rad.  speed: [7] rad/s and effort: [7] N m, the arm's limits.  stiffness: [7] N m/rad of its
-    position servo, damping: [7] N m s/rad: what to set on the robot.
-    workspace: [2, 3] m, lowest and highest corner of where the pinch point may be, base frame.
-    chain: [8, 4, 4] from base to joint 1, joint to joint, joint 7 to pinch point, all joints at zero, each joint
-    turning about its frame's z axis.
-    pads: [2, 3] m of the pads in the pinch point's frame, shut; slides: [2, 3] how they move with a finger's position.
-    start: [9] rad and m, arm and fingers where training starts; knob: [4, 4] pose of the knob then, base frame, m.
+    Attributes:
+        period: s between actions.
+        reach: rad, distance of a joint's target from its position for an action of one.
+        width: m, finger command for an action of one; minus one closes the fingers.
+        ranges: [7, 2] rad, of the joints.
+        speed: [7] rad/s, velocity limits.
+        effort: [7] N m, torque limits.
+        stiffness: [7] N m/rad, of the position servos, to be set on the robot.
+        damping: [7] N m s/rad, likewise.
+        workspace: [2, 3] m, lowest and highest corner of the pinch point's workspace, base frame.
+        chain: [8, 4, 4] transforms from base to joint 1, joint to joint, and joint 7 to pinch point, with all joints at
+            zero.  Each joint turns about its frame's z axis.
+        pads: [2, 3] m, pads in the pinch point's frame with closed fingers.
+        slides: [2, 3] direction in which a pad moves with its finger's position.
+        start: [9] rad and m, arm and fingers at the start of the training.
+        knob: [4, 4] pose of the knob at that start, base frame, m.
     """
 
     period: float
@@ -74,15 +81,20 @@ class Interface:
 
 
 def differing(one: Interface, other: Interface) -> list[str]:
-    """Names of the fields in which two interfaces differ by more than single precision does."""
+    """Names of the fields in which two interfaces differ by more than single-precision rounding."""
     both = ((f.name, getattr(one, f.name), getattr(other, f.name)) for f in fields(Interface))
     return [name for name, a, b in both if not np.allclose(a, b, rtol=1e-5, atol=1e-6)]
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """mean, std: [23] of the observations seen in training.  weights, biases: of each layer, the last of twice
-    nine numbers, of which the first nine are the action's mean before tanh."""
+    """A trained network with the normalisation of its observations.
+
+    Attributes:
+        mean, std: [23] of the observations in training.
+        weights, biases: of each layer.  The last has 18 outputs, of which the first nine are the action before tanh.
+        interface: of the robot.
+    """
 
     mean: np.ndarray
     std: np.ndarray
@@ -99,31 +111,34 @@ class Policy:
 
 
 def arrays(policy: Policy) -> dict[str, Any]:
-    """The content of a policy's npz file: mean, std, weight_0, bias_0, ..., the interface, the layout in words."""
+    """The content of a policy's npz file: mean, std, weight_0, bias_0, ..., the interface, the observation's layout."""
     layers = {f"weight_{k}": w for k, w in enumerate(policy.weights)}
     layers |= {f"bias_{k}": b for k, b in enumerate(policy.biases)}
     interface: Any = {f.name: getattr(policy.interface, f.name) for f in fields(Interface)}
-    own = {"format": FORMAT, "layout": np.array(LAYOUT), "mean": policy.mean, "std": policy.std}
-    return {**own, **layers, **interface}
+    head = {"format": FORMAT, "layout": np.array(LAYOUT), "mean": policy.mean, "std": policy.std}
+    return {**head, **layers, **interface}
 
 
 def load_policy(path: str | Path) -> Policy:
-    """ValueError names what is wrong with a file: missing, damaged, no numbers, of another layout of observations."""
+    """Read a policy's npz file.
+
+    Raises ValueError for a file that is missing, damaged, not finite, or of another layout of observations.
+    """
     try:
         found = _arrays(Path(path))
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file; `train` and `export` write it") from None
-    except Exception as error:  # what zipfile, zlib and numpy raise on damaged files is of many kinds
-        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise ValueError(f"{path} cannot be read: {said}") from None
+    except Exception as error:  # zipfile, zlib and numpy raise many types for damaged files
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise ValueError(f"{path} cannot be read: {reason}") from None
     if str(found.get("format")) != FORMAT:
         raise ValueError(f"{path} is no policy: expected format {FORMAT!r}, got {ascii(str(found.get('format')))[:80]}")
     layers = range(sum(name.startswith("weight_") for name in found))
     names = [f"{kind}_{k}" for kind in ("weight", "bias") for k in layers]
     numeric = ("mean", "std", *names, *(f.name for f in fields(Interface)))
-    lacking = [name for name in dict.fromkeys(("layout", *numeric, "weight_0")) if name not in found]
-    if lacking:
-        raise ValueError(f"{path} lacks {', '.join(lacking)}")
+    missing = [name for name in dict.fromkeys(("layout", *numeric, "weight_0")) if name not in found]
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(missing)}")
     layout = [str(name) for name in found["layout"].reshape(-1)]
     if found["layout"].shape != (OBSERVED,) or tuple(layout) != LAYOUT:
         other = [ascii(name)[1:-1][:80] for name in layout if name not in LAYOUT] or ["another order"]
@@ -140,9 +155,9 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a policy's file: numbers and text whose sizes are known before memory is taken.
+    """The arrays of a policy's file, numbers and text, whose sizes are checked before they are read.
 
-    Of its own, since this file goes to the robot alone.
+    Not shared with the package's reader, since the robot gets this file only.
     """
     if not path.is_file() and path.exists():
         raise ValueError("it is no regular file")
@@ -176,7 +191,7 @@ def _array(content: bytes, name: str) -> np.ndarray:
 
 
 def _misshapen(found: Mapping[str, np.ndarray], layers: int) -> str | None:
-    """The first array of a policy's file that does not fit to the others, in words."""
+    """The first array of a policy's file with a wrong shape, for messages; None if there is none."""
     inner = [found[f"bias_{k}"].size for k in range(layers - 1)]
     sizes = [OBSERVED, *inner, 2 * ACTIONS]
     expected: dict[str, tuple[int, ...]] = {"mean": (OBSERVED,), "std": (OBSERVED,), **SHAPES}
@@ -189,7 +204,7 @@ def _misshapen(found: Mapping[str, np.ndarray], layers: int) -> str | None:
 
 
 def _not_above_zero(found: Mapping[str, np.ndarray]) -> str | None:
-    """The first array of a policy's file that must be above zero and is not, in words."""
+    """The first array of a policy's file that must be above zero but is not, for messages; None if there is none."""
     for name in ("std", *POSITIVE):
         if (found[name] <= 0.0).any():
             return f"{name} must be above zero, got {found[name].min():g}"
@@ -198,12 +213,17 @@ def _not_above_zero(found: Mapping[str, np.ndarray]) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What a robot says of itself at one instant.
+    """The state of a robot at one instant.
 
-    time: s, any clock that runs on.  position: [7] rad, velocity: [7] rad/s, of the arm.  torque: [7] N m, without
-    what carries the arm's own weight, or None.  fingers: [2] m, how far each stands from shut.  knob: [4, 4] pose of
-    the knob in the robot's base frame, m: x the door's inward normal, z up.  sight: s, when the knob was there, on the
-    same clock; None where it is as new as the rest (a pose computed from an encoder of the hinge, say).
+    Attributes:
+        time: s, of any monotonic clock.
+        position: [7] rad, of the arm.
+        velocity: [7] rad/s, of the arm.
+        torque: [7] N m, without gravity compensation; None if not measured.
+        fingers: [2] m, distance of each finger from its closed position.
+        knob: [4, 4] pose of the knob in the robot's base frame, m; x is the door's inward normal, z is up.
+        sight: s, time of the knob's pose on the same clock; None if it is as recent as the rest (such as a pose that is
+            computed from an encoder of the hinge).
     """
 
     time: float
@@ -217,7 +237,7 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """arm: [7] rad and fingers: [2] m, for position servos.  stopped: why the loop stopped, where it did."""
+    """Targets of the position servos: arm [7] rad and fingers [2] m; why the loop stopped, if it did."""
 
     arm: np.ndarray
     fingers: np.ndarray
@@ -225,7 +245,7 @@ class Command:
 
 
 def pinch_pose(interface: Interface, position: np.ndarray) -> np.ndarray:
-    """[4, 4] the pinch point in the base frame at joint positions [7]."""
+    """[4, 4] pose of the pinch point in the base frame at joint positions [7], rad."""
     pose = interface.chain[0]
     for angle, link in zip(position, interface.chain[1:], strict=True):
         c, s = np.cos(angle), np.sin(angle)
@@ -234,22 +254,28 @@ def pinch_pose(interface: Interface, position: np.ndarray) -> np.ndarray:
 
 
 def observe(interface: Interface, reading: Reading) -> np.ndarray:
-    """[23] as `LAYOUT` says."""
+    """[23] the observation of a reading (`LAYOUT`)."""
     hand = pinch_pose(interface, reading.position)
     pads = interface.pads + reading.fingers[:, None] * interface.slides
     points = np.vstack([hand[:3, 3], pads @ hand[:3, :3].T + hand[:3, 3]])
-    near = (points - reading.knob[:3, 3]) @ reading.knob[:3, :3]
-    return np.concatenate([reading.position, reading.velocity, near.reshape(-1)])
+    in_knob_frame = (points - reading.knob[:3, 3]) @ reading.knob[:3, :3]
+    return np.concatenate([reading.position, reading.velocity, in_knob_frame.reshape(-1)])
 
 
 @dataclass(frozen=True)
 class Safety:
-    """When the loop stops.
+    """Limits at which the control loop stops.
 
-    late, early: shares of the period by which a reading may come late or early.  speed, effort: shares of the arm's
-    limits that measured velocities and torques may reach.  margin: rad that targets keep from the ends of the joints'
-    ranges, and by which a joint may be beyond them.  off, turned: m and rad by which the knob may be away from where
-    it was in training when the loop begins.  old: s by which the sight of the knob may be older than its reading.
+    Attributes:
+        late: largest delay of a reading, as a share of the period.
+        early: largest advance of a reading, as a share of the period.
+        speed: largest measured velocity, as a share of the arm's limit.
+        effort: largest measured torque, as a share of the arm's limit.
+        margin: rad, least distance of targets from the ends of the joints' ranges, and largest distance of a joint
+            beyond them.
+        off: m, largest distance of the knob from its position in training when the loop begins.
+        turned: rad, likewise of its rotation.
+        old: s, largest age of the knob's pose relative to its reading.
     """
 
     late: float = 0.5
@@ -263,25 +289,28 @@ class Safety:
 
 
 class Controller:
-    """The policy as a control loop: a reading in, a command out.
+    """The control loop of a policy, from a reading to a command.
 
-    Targets stay inside the joints' ranges and so near to where the arm is that the spring torque of the servo,
-    stiffness times distance, stays inside the joints' limits.  The loop stops, and from then on commands the pose of
-    the last good reading, when a reading (or its sight of the knob) is stale, late, early, of a wrong shape or no
-    number, when a joint is beyond its range, a measured velocity or torque beyond its limit, the hand outside the
-    workspace, or the command no number; `stopped` says why.
+    Targets stay inside the joints' ranges.  They also stay so close to the arm that the servo's spring torque,
+    stiffness times distance, is within the joints' limits.  The loop stops if
+
+    - a reading or its pose of the knob is stale, late, early, of a wrong shape, or not finite,
+    - a joint is out of its range, or a measured velocity or torque exceeds its limit,
+    - the hand is outside the workspace, or the command is not finite.
+
+    From then on it commands the pose of the last valid reading, and `stopped` gives the reason.
     """
 
     def __init__(self, policy: Policy, safety: Safety | None = None):
         self.policy, self.safety = policy, safety or Safety()
         self.stopped: str | None = None
-        self._held: Command | None = None
+        self._hold: Command | None = None
         self._time = -np.inf
 
     def act(self, reading: Reading) -> Command:
         """The command for the period that begins with this reading.
 
-        Raises ValueError where already the first reading is of no use: there is no pose to hold then.
+        Raises ValueError if the first reading is invalid, since there is no pose to hold.
         """
         if self.stopped is None:
             try:
@@ -293,20 +322,20 @@ class Controller:
             action = self.policy.act(observe(self.policy.interface, reading))
             command = limited(self.policy.interface, self.safety, reading.position, action)
             if np.isfinite(command.arm).all() and np.isfinite(command.fingers).all():
-                self._held, self._time = Command(reading.position, command.fingers), reading.time
+                self._hold, self._time = Command(reading.position, command.fingers), reading.time
                 return command
             self.stopped = "the policy's command holds a value that is NaN or infinite"
         return self.hold()
 
     def hold(self) -> Command:
-        """The pose of the last good reading, fingers as they were told last.  ValueError where there was none."""
-        if self._held is None:
+        """The arm's pose of the last valid reading and the last finger command; ValueError if there is none."""
+        if self._hold is None:
             raise ValueError(f"cannot begin: {self.stopped or 'nothing was read yet'}")
-        return Command(self._held.arm, self._held.fingers, self.stopped)
+        return Command(self._hold.arm, self._hold.fingers, self.stopped)
 
 
 def _copied(reading: Reading) -> Reading:
-    """Arrays of its own: a driver may write into the ones it handed over."""
+    """A copy, since a driver may write into its arrays later."""
     return Reading(
         time=reading.time,
         position=np.array(reading.position, float),
@@ -319,32 +348,35 @@ def _copied(reading: Reading) -> Reading:
 
 
 def limited(interface: Interface, safety: Safety, position: Any, action: Any, numbers: Any = np) -> Command:
-    """The command of an action [9] at joint positions [7], inside torques and ranges; numbers: numpy or jax.numpy.
+    """The command of an action [9] at joint positions [7], limited by torques and ranges.
 
-    Training commands by this too, so that a policy learns what the robot will do.
+    Training uses it too, so that a policy is trained with the limits of the robot.  numbers: numpy or jax.numpy.
     """
     action = numbers.clip(action, -1.0, 1.0)
-    near = interface.effort / interface.stiffness
+    farthest = interface.effort / interface.stiffness
     low, high = interface.ranges[:, 0] + safety.margin, interface.ranges[:, 1] - safety.margin
-    arm = numbers.clip(position + numbers.clip(interface.reach * action[:ARM], -near, near), low, high)
+    arm = numbers.clip(position + numbers.clip(interface.reach * action[:ARM], -farthest, farthest), low, high)
     return Command(arm, 0.5 * interface.width * (1.0 + action[ARM:]))
 
 
 def fault(interface: Interface, safety: Safety, reading: Reading, before: float) -> str | None:
-    """What forbids going on from a reading, in words; before: time of the one before it, s, minus infinity for none."""
-    wrong = _unusable({"position": (reading.position, (ARM,)), "velocity": (reading.velocity, (ARM,)),
-                       "fingers": (reading.fingers, (FINGERS,)), "knob": (reading.knob, (4, 4)),
-                       **({} if reading.torque is None else {"torque": (reading.torque, (ARM,))})})  # fmt: skip
-    if wrong is not None:
-        return wrong
+    """Why the loop must stop at a reading; None if it may continue.
+
+    before: s, time of the reading before it; minus infinity for the first.
+    """
+    invalid = _invalid({"position": (reading.position, (ARM,)), "velocity": (reading.velocity, (ARM,)),
+                        "fingers": (reading.fingers, (FINGERS,)), "knob": (reading.knob, (4, 4)),
+                        **({} if reading.torque is None else {"torque": (reading.torque, (ARM,))})})  # fmt: skip
+    if invalid is not None:
+        return invalid
     if not np.isfinite(reading.time) or reading.time <= before:
-        return f"stale reading: its time is {reading.time:g} s, that of the one before {before:g} s"
+        return f"stale reading: its time is {reading.time:g} s, the last one's was {before:g} s"
     if reading.time - before < (1.0 - safety.early) * interface.period:
         return f"early: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
     if reading.time - before > (1.0 + safety.late) * interface.period and np.isfinite(before):
         return f"late: {1e3 * (reading.time - before):.0f} ms between readings, expected {1e3 * interface.period:.0f}"
-    if reading.sight is not None and not abs(reading.time - reading.sight) <= safety.old:  # no number is stale too
-        return f"stale sight of the knob: it is of {reading.sight:g} s, the reading of {reading.time:g} s"
+    if reading.sight is not None and not abs(reading.time - reading.sight) <= safety.old:  # NaN is stale too
+        return f"stale pose of the knob: it is of {reading.sight:g} s, the reading of {reading.time:g} s"
     middle, half = interface.ranges.mean(axis=1), np.ptp(interface.ranges, axis=1) / 2 + safety.margin
     outside = _beyond(reading.position - middle, half, "rad from the middle of its range")
     if outside is not None:
@@ -352,9 +384,9 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
     fast = _beyond(reading.velocity, safety.speed * interface.speed, "rad/s")
     if fast is not None:
         return f"too fast: {fast}"
-    strained = None if reading.torque is None else _beyond(reading.torque, safety.effort * interface.effort, "N m")
-    if strained is not None:
-        return f"too much torque: {strained}"
+    overload = None if reading.torque is None else _beyond(reading.torque, safety.effort * interface.effort, "N m")
+    if overload is not None:
+        return f"too much torque: {overload}"
     point = pinch_pose(interface, reading.position)[:3, 3]
     if (point < interface.workspace[0]).any() or (point > interface.workspace[1]).any():
         return f"the hand has left its workspace: it is at ({', '.join(f'{x:.2f}' for x in point)}) m"
@@ -362,23 +394,23 @@ def fault(interface: Interface, safety: Safety, reading: Reading, before: float)
 
 
 def _knob_elsewhere(interface: Interface, safety: Safety, knob: np.ndarray, first: bool) -> str | None:
-    """A pose that is none, or, when the loop begins, a knob that is not where it was in training."""
-    turn = knob[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-        return "the knob's pose is no pose: its first three rows and columns are no rotation"
+    """Why a pose of the knob is invalid, or not the one of the training if the reading is the first; else None."""
+    rotation = knob[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        return "the knob's pose is invalid: its first three rows and columns are no rotation"
     if not first:
         return None
-    off = float(np.linalg.norm(knob[:3, 3] - interface.knob[:3, 3]))
-    angle = float(np.arccos(np.clip((np.trace(interface.knob[:3, :3].T @ turn) - 1) / 2, -1, 1)))
-    if off > safety.off or angle > safety.turned:
+    distance = float(np.linalg.norm(knob[:3, 3] - interface.knob[:3, 3]))
+    angle = float(np.arccos(np.clip((np.trace(interface.knob[:3, :3].T @ rotation) - 1) / 2, -1, 1)))
+    if distance > safety.off or angle > safety.turned:
         return (
-            f"the knob is elsewhere: {off:.2f} m and {angle:.2f} rad from where it was in training, "
+            f"the knob is elsewhere: {distance:.2f} m and {angle:.2f} rad from its pose in training, "
             f"({', '.join(f'{x:.2f}' for x in interface.knob[:3, 3])}) m in the base frame"
         )
     return None
 
 
-def _unusable(values: Mapping[str, tuple[Any, tuple[int, ...]]]) -> str | None:
+def _invalid(values: Mapping[str, tuple[Any, tuple[int, ...]]]) -> str | None:
     for name, (value, shape) in values.items():
         if np.shape(value) != shape:
             return f"{name} must have shape {list(shape)}, got {list(np.shape(value))}"
@@ -396,37 +428,37 @@ def _beyond(values: np.ndarray, limits: np.ndarray, unit: str) -> str | None:
 
 
 class ControlledRobot(Protocol):
-    """What `drive` asks of a robot."""
+    """The interface that `drive` needs of a robot."""
 
     def read(self) -> Reading:
-        """The state of now."""
+        """The current state."""
         ...
 
     def send(self, command: Command) -> None:
-        """Hand the targets to the servos."""
+        """Send the targets to the servos."""
         ...
 
     def wait(self, period: float) -> None:
-        """Sleep until the next period begins, s."""
+        """Sleep until the next period begins; period: s."""
         ...
 
 
 def drive(controller: Controller, robot: ControlledRobot, seconds: float) -> str | None:
-    """Let the policy drive a robot for so long, or until it stops; why it stopped, or None.
+    """Control a robot for `seconds` s, or until the loop stops; returns why it stopped, or None.
 
-    In the end, and where the robot's own functions raise, the robot is told to hold its last pose, once: one that wants
-    commands all the time must go on with `Controller.hold`.
+    At the end, also if a function of the robot raises, the robot is sent one command to hold its pose.  A robot that
+    needs commands continuously must be sent `Controller.hold` further on.
     """
-    begun = False
+    started = False
     try:
         for _ in range(round(seconds / controller.policy.interface.period)):
             command = controller.act(robot.read())
-            begun = True
+            started = True
             if command.stopped is not None:
                 break
             robot.send(command)
             robot.wait(controller.policy.interface.period)
     finally:
-        if begun:
+        if started:
             robot.send(controller.hold())
     return controller.stopped

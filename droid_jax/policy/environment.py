@@ -1,4 +1,4 @@
-"""What training and trials ask of an environment: brax's, with the scene, the task and the interface behind it."""
+"""The environment interface of training and trials: brax's, with the scene, the task and the robot interface."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from droid_jax.policy.control import Interface
 
 
 class Environment(Env):
-    """A brax environment whose `sys` is `Physics` and whose metrics have success, angle, grip and blown_up.
+    """A brax environment whose `sys` is `Physics` and whose metrics are success, angle, grip and blown_up.
 
-    task: a dataclass of numbers that a policy belongs to; `steps`: actions of an episode at most.
-    effects: of an extended model.  start: [nq] where an episode starts.  interface: what a robot must know of it.
+    Attributes:
+        scene: of the environment.
+        task: a dataclass of numbers; `steps` is the largest number of actions of an episode.
+        effects: of an extended model.
+        start: [nq] pose at the start of an episode.
+        interface: of a robot that uses the policy.
+        sys: the physics.
     """
 
     scene: Scene

@@ -1,4 +1,4 @@
-"""A policy in the simulation that it was trained in, or in another one: many episodes in one batch."""
+"""Evaluate a policy in simulation: many episodes in one batch."""
 
 from __future__ import annotations
 
@@ -25,10 +25,22 @@ jax.tree_util.register_dataclass(  # not where it is defined: control.py needs n
 
 
 def simulated(policy: Policy, env: Environment, randomise: Randomise | None, episodes: int, seed: int = 0) -> Trials:
-    """Episodes of the deterministic policy, each in its own draw of the physics (without, all in the scene's own).
+    """Simulate episodes of the deterministic policy.
 
-    The policy and what varies are arguments of the program, so that other policies and draws find it compiled.
-    Raises ValueError for a policy of another robot, door or task than the environment's.
+    The policy and the physics that vary are inputs of the program, so that other policies and draws share it.
+
+    Args:
+        policy: to be evaluated.
+        env: of the same robot, door and task.
+        randomise: draws the physics of each episode; None: all episodes have the environment's physics.
+        episodes: number of them.
+        seed: of starts and draws.
+
+    Returns:
+        The outcomes.
+
+    Raises:
+        ValueError: the policy was trained for another robot, door or task.
     """
     if other := differing(policy.interface, env.interface):
         raise ValueError(f"the policy was trained for another robot, door or task: {', '.join(other)} differ")
@@ -46,8 +58,8 @@ def simulated(policy: Policy, env: Environment, randomise: Randomise | None, epi
             after = many.step(state, policy.act(state.obs, jnp))
             state = jax.tree.map(lambda new, old: jnp.where(_as(going, new), new, old), after, state)
             best = jnp.maximum(best, state.metrics["angle"])
-            seen = going * after.metrics["success"], going * after.metrics["grip"]
-            return (state, won + seen[0], best, grips + seen[1], count + going, steps + (going & (won == 0.0))), None
+            success, grip = going * after.metrics["success"], going * after.metrics["grip"]
+            return (state, won + success, best, grips + grip, count + going, steps + (going & (won == 0.0))), None
 
         nothing = jnp.zeros(episodes)
         carry = (many.reset(keys), nothing, nothing, nothing, nothing, nothing)
@@ -61,13 +73,13 @@ def simulated(policy: Policy, env: Environment, randomise: Randomise | None, epi
 
 
 def _varied(axes: Any, drawn: Any) -> Any:
-    """Physics with None for what all episodes share: that stays a constant of the program."""
+    """The physics with None for leaves that all episodes share, which are constants of the program."""
     return jax.tree.map(lambda axis, leaf: None if axis is None else leaf, axes, drawn, is_leaf=_shared)
 
 
 def _filled(axes: Any, varied: Any, drawn: Any) -> Any:
     """The inverse of `_varied`."""
-    return jax.tree.map(lambda a, own, leaf: leaf if a is None else own, axes, varied, drawn, is_leaf=_shared)
+    return jax.tree.map(lambda a, each, leaf: leaf if a is None else each, axes, varied, drawn, is_leaf=_shared)
 
 
 def _shared(axis: int | None) -> bool:

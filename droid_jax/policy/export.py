@@ -1,4 +1,4 @@
-"""A policy to take along: npz, ONNX and the control loop in one folder."""
+"""Export a policy for a robot: npz, ONNX and the control loop in one folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from droid_jax.policy.control import ACTIONS, ARM, LAYOUT, OBSERVED, Policy, arr
 from droid_jax.storage import npz_bytes, write_own
 
 OPSET = 17
-CLOSE = 2e-5  # largest difference of an action, of -1 .. 1, between float32 programs
+CLOSE = 2e-5  # largest difference of an action (of -1 .. 1) between two float32 programs of one policy
 OUTPUTS = (
     *(f"target of joint {i}, in units of reach from where the joint is" for i in range(1, ARM + 1)),
     *(f"target of the {side} finger, -1 shut, 1 open" for side in ("left", "right")),
@@ -25,25 +25,25 @@ OUTPUTS = (
 
 
 def export(folder: Path, policy: Policy) -> float:
-    """Write policy.npz, policy.onnx and control.py; the largest difference of an action between ONNX and JAX.
+    """Write policy.npz, policy.onnx and control.py; returns the largest difference of an action between ONNX and JAX.
 
-    Raises ValueError where onnx or onnxruntime is not installed, the two differ by more than `CLOSE`, or the folder
-    holds a file of one of these names that `export` did not write, or that was changed since.
+    Raises ValueError if onnx or onnxruntime is not installed, the two differ by more than `CLOSE`, or the folder has a
+    file of one of these names that `export` did not write or that was changed since.
     """
     needs("export needs", "export", "onnx", "onnxruntime")
     model = to_onnx(policy)
-    apart = difference(policy, model)
-    if not apart <= CLOSE:
-        raise ValueError(f"the ONNX policy differs from the JAX policy by {apart:.2g} in an action: it is not written")
+    error = difference(policy, model)
+    if not error <= CLOSE:
+        raise ValueError(f"the ONNX policy differs from the JAX policy by {error:.2g} in an action: it is not written")
     code = Path(control.__file__).read_bytes()
     write_own(folder, {POLICY: npz_bytes(arrays(policy)), "policy.onnx": model, "control.py": code})
-    return apart
+    return error
 
 
 def to_onnx(policy: Policy) -> bytes:
-    """observation [N, 23] float32 -> action [N, 9] in -1 .. 1, the normalisation included.
+    """The policy as an ONNX model: observation [N, 23] float32 -> action [N, 9] in -1 .. 1, with the normalisation.
 
-    The file's metadata say what the numbers mean, the period in s, reach in rad and width in m.
+    The model's metadata describe the observation and the action, and hold the period [s], reach [rad] and width [m].
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -62,8 +62,8 @@ def to_onnx(policy: Policy) -> bytes:
     x = node("Div", "normalised", x, constant("std", policy.std))
     last = len(policy.weights) - 1
     for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        kept = slice(ACTIONS) if k == last else slice(None)  # the widths of the actions are training's business
-        inputs = constant(f"weight_{k}", weight[:, kept]), constant(f"bias_{k}", bias[kept])
+        columns = slice(ACTIONS) if k == last else slice(None)  # the others are deviations, used in training only
+        inputs = constant(f"weight_{k}", weight[:, columns]), constant(f"bias_{k}", bias[columns])
         x = node("Gemm", f"layer_{k}", x, *inputs)
         x = node("Tanh", "action" if k == last else f"hidden_{k}", x)
     ends = [

@@ -1,4 +1,4 @@
-"""The policy out of brax's networks, and its file."""
+"""Convert brax's networks to a policy, and write its file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from droid_jax.storage import write_npz
 
 
 def layer_sizes(hidden: tuple[int, ...]) -> tuple[int, ...]:
-    """Numbers between the layers, from the observation to mean and width of each action."""
+    """Sizes between the layers, from the observation to mean and deviation of each action."""
     return (OBSERVED, *hidden, 2 * ACTIONS)
 
 
 def policy_of(normaliser: Any, actor: Any, sizes: tuple[int, ...], interface: Interface) -> Policy:
-    """Out of brax's running statistics and its actor's parameters.  ValueError for a network of other sizes."""
+    """The policy of brax's running statistics and actor parameters; ValueError for a network of other sizes."""
     layers = [actor["params"][f"hidden_{k}"] for k in range(len(sizes) - 1)]
     weights = tuple(np.asarray(layer["kernel"], np.float32) for layer in layers)
     found = (weights[0].shape[0], *(w.shape[1] for w in weights))
@@ -33,5 +33,5 @@ def policy_of(normaliser: Any, actor: Any, sizes: tuple[int, ...], interface: In
 
 
 def save_policy(path: Path, policy: Policy) -> None:
-    """One npz file, which `control.load_policy` reads."""
+    """Write the npz file that `control.load_policy` reads."""
     write_npz(path, arrays(policy))

@@ -1,7 +1,7 @@
-"""Environments side by side, each with physics of its own, on every device with other ones.
+"""Batched environments with different physics in each environment and on each device.
 
-brax gives every device the same keys to randomise with: on sixteen devices 256 environments would share 16 doors.
-And it draws them anew for every part of a training that was interrupted.
+brax gives all devices the same keys for its randomisation: on sixteen devices 256 environments would share 16 doors.
+It also draws new physics for each part of an interrupted training.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ AXIS = "i"  # brax's name for its devices
 
 
 def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..., Env]:
-    """What brax's PPO shall do with an environment before it trains in it, and again before it tries in it.
+    """The wrapper that brax's PPO applies to its environment, once for training and once for evaluations.
 
-    Tried are other doors than those it trains on, lest the best of several policies is chosen for its own doors.
+    Evaluations have other draws of the physics than training.  Otherwise the best policy would be selected on its
+    training draws.
     """
     uses = itertools.count()
 
@@ -36,15 +37,15 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
             return wrap(env, episode_length, action_repeat)
         count = len(randomization_fn.keywords["rng"])  # of environments on one device
         use = next(uses)
-        there = 1 if use else devices  # it tries on one, so that the best policy is chosen for the same doors anywhere
-        doors = Doors(env, randomise, count, there, jax.random.fold_in(jax.random.PRNGKey(seed), use))
-        return AutoResetWrapper(EpisodeWrapper(doors, episode_length, action_repeat))
+        used = 1 if use else devices  # evaluations use one, so that their draws do not depend on the machine
+        drawn = RandomisedEnvs(env, randomise, count, used, jax.random.fold_in(jax.random.PRNGKey(seed), use))
+        return AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
 
     return wrap_env
 
 
-class Doors(Wrapper):
-    """`count` environments on each device; physics are drawn once, for all devices, from the key alone."""
+class RandomisedEnvs(Wrapper):
+    """`count` environments on each device, whose physics are drawn once for all devices from one key."""
 
     def __init__(self, env: Env, randomise: Randomise, count: int, devices: int, key: jax.Array) -> None:
         super().__init__(env)
@@ -53,21 +54,21 @@ class Doors(Wrapper):
         self.physics, self.axes = randomise(sys, jax.random.split(key, count * devices))
 
     def reset(self, rng: jax.Array) -> State:
-        """rng: [count] keys."""
+        """Reset `count` environments; rng: [count] keys."""
         return self._each(lambda env, key: env.reset(key), rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """state, action: of `count` environments."""
+        """Step `count` environments."""
         return self._each(lambda env, s, a: env.step(s, a), state, action)
 
     def _each(self, act: Callable[..., State], *arguments: Any) -> State:
-        def one(sys: Any, *own: Any) -> State:
-            with self._having(sys) as env:
-                return act(env, *own)
+        def one(sys: Any, *values: Any) -> State:
+            with self._with_physics(sys) as env:
+                return act(env, *values)
 
-        return jax.vmap(one, in_axes=(self.axes, *(0 for _ in arguments)))(self._own(), *arguments)
+        return jax.vmap(one, in_axes=(self.axes, *(0 for _ in arguments)))(self._physics_here(), *arguments)
 
-    def _own(self) -> Any:
+    def _physics_here(self) -> Any:
         """The physics of this device's environments."""
         first = device_index() * self.count
 
@@ -77,7 +78,7 @@ class Doors(Wrapper):
         return jax.tree.map(rows, self.axes, self.physics, is_leaf=lambda axis: axis is None)
 
     @contextlib.contextmanager
-    def _having(self, sys: Any) -> Iterator[Any]:
+    def _with_physics(self, sys: Any) -> Iterator[Any]:
         env: Any = self.env.unwrapped
         before, env.sys = env.sys, sys
         try:
@@ -87,8 +88,8 @@ class Doors(Wrapper):
 
 
 def device_index() -> jax.Array:
-    """Number of the device that brax runs this on; 0 where it uses one alone, as in its evaluations."""
+    """Index of the device on which brax runs this; 0 if it uses one device, as in evaluations."""
     try:
         return jax.lax.axis_index(AXIS)
-    except NameError:  # no such axis here
+    except NameError:  # no mapped axis
         return jnp.zeros((), jnp.int32)

@@ -1,8 +1,8 @@
-"""From a Gaussian over parameters to randomised physics: brax's randomization_fn(sys, rng) -> (sys_v, in_axes).
+"""Randomise physics by a Gaussian over parameters: brax's randomization_fn(sys, rng) -> (sys_v, in_axes).
 
-Any Gaussian will do: the prior, a fitted mean alone (`fixed`), CMA-ES's covariance or the calibrated one.  `sys` is
-our `Physics`, so that parameters outside the model (effects) vary too.  Only fields that parameters write, and what
-follows from them, are batched.
+The Gaussian may be the prior, CMA-ES's covariance or the calibrated one; `fixed` uses one vector.  `sys` is `Physics`,
+so that parameters outside the model (of effects) vary too.  Only fields that parameters write, and fields derived from
+them, are batched.
 """
 
 from __future__ import annotations
@@ -51,23 +51,23 @@ def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
 
 
 def of_method(method: str, scene: Scene, gaussian: Gaussian) -> Randomise:
-    """Draws of the Gaussian, or its middle alone where the method of Table II is "mean"."""
+    """The randomisation of a method of Table II: the Gaussian's centre for "mean", else draws of the Gaussian."""
     return fixed(scene, gaussian.space, gaussian.centre) if method == "mean" else randomised(scene, gaussian)
 
 
 def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
-    """A randomization_fn for environments that know an mjx.Model only (mujoco_playground's): the model fields alone.
+    """A randomization_fn for environments whose `sys` is an mjx.Model (mujoco_playground's): it varies model fields.
 
-    Numbers that no parameter writes stay the environment's own, those apart that follow from masses and places: they
-    are the scene's. Warns of parameters that live outside the model: they have no place there and stay at neutral.
+    Entries that no parameter writes keep the environment's values, except those derived from masses and positions,
+    which are the scene's. It warns of parameters that are not fields of the model; they do not vary.
 
     Args:
         scene: of the same MJCF, whose visual geoms the environment may have.
         gaussian: over any part of the scene's parameters.
 
     Returns:
-        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError when called with a model of
-        another scene, or with one in which a friction loss that varies has no row.
+        (mjx.Model, rng [N, 2]) -> (batched mjx.Model, in_axes). It raises ValueError for a model of another scene, and
+        for a model in which a friction loss that varies has no constraint row.
 
     Raises:
         ValueError: a Gaussian of another scene.
@@ -76,11 +76,11 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
     outside = [p.name for p in gaussian.space.parameters if not p.writes]
     if outside:
         warnings.warn(
-            f"an environment that knows an mjx.Model only cannot vary {', '.join(outside)}: they are no fields of it",
+            f"an environment with an mjx.Model cannot vary {', '.join(outside)}: they are no fields of the model",
             stacklevel=2,
         )
     written = dict[str, list[tuple[int, ...]]]()
-    for field, index in entries_written(gaussian.space):  # of a unit vector all that was scaled with what is written
+    for field, index in entries_written(gaussian.space):  # writing an entry of a unit vector changes the whole vector
         written.setdefault(field, []).append(index[: 1 if field in UNIT else None])
 
     def randomise(model: Any, rng: jax.Array) -> tuple[Any, Any]:
@@ -89,52 +89,52 @@ def randomised_model(scene: Scene, gaussian: Gaussian) -> Randomise:
         drawn, _ = both(Physics(scene.mjx, {}), rng)
         values = {field: getattr(drawn.model, field) for field in fields}
         for field in (f for f in fields if f in written or f in geoms):
-            own, ids = jnp.repeat(getattr(model, field)[None], _count(rng), axis=0), geoms.get(field, slice(None))
-            for index in written.get(field, [()]):  # of a derived field everything
-                at = (np.arange(own.shape[1])[ids][index[0]], *index[1:]) if index else (ids,)
-                own = own.at[(slice(None), *at)].set(values[field][(slice(None), *index)])
-            values[field] = own
+            batch, ids = jnp.repeat(getattr(model, field)[None], _count(rng), axis=0), geoms.get(field, slice(None))
+            for index in written.get(field, [()]):  # a derived field is replaced as a whole
+                at = (np.arange(batch.shape[1])[ids][index[0]], *index[1:]) if index else (ids,)
+                batch = batch.at[(slice(None), *at)].set(values[field][(slice(None), *index)])
+            values[field] = batch
         if "eq_data" in values:
-            own = jnp.repeat(model.eq_data[None], _count(rng), axis=0)
+            batch = jnp.repeat(model.eq_data[None], _count(rng), axis=0)
             for rows in joined_bodies(scene.mjx).values():
-                own = own.at[:, rows, POSE].set(values["eq_data"][:, rows, POSE])
-            values["eq_data"] = own
+                batch = batch.at[:, rows, POSE].set(values["eq_data"][:, rows, POSE])
+            values["eq_data"] = batch
         return model.replace(**values), _zeros(model, fields)
 
     return randomise
 
 
 def _geoms_among(scene: Scene, model: Any, fields: Sequence[str]) -> dict[str, np.ndarray]:
-    """geom_ field -> ids of the scene's geoms in a model that has the looks too; empty where it has none.
+    """geom_ field -> ids of the scene's geoms in a model with visual geoms; empty for a model without.
 
-    ValueError where a field's shape is of another scene.
+    Raises ValueError if a field has another shape than in the scene.
     """
-    looks = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
-    rows = {field: scene.full_geom_ids for field in fields if looks and field.startswith("geom_")}
+    visual = model.ngeom != scene.model.ngeom and len(scene.spec.geoms) == model.ngeom
+    rows = {field: scene.full_geom_ids for field in fields if visual and field.startswith("geom_")}
     for field in fields:
-        own, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
-        if own != given and not (field in rows and own[1:] == given[1:]):
+        expected, given = (jax.tree.map(jnp.shape, getattr(m, field)) for m in (scene.mjx, model))
+        if expected != given and not (field in rows and expected[1:] == given[1:]):
             raise ValueError(
-                f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {own}: the "
+                f"the environment's model has {field} of shape {given}, the scene {scene.name!r} of {expected}: the "
                 "scene must be of the environment's MJCF"
             )
     return rows
 
 
 def _check_friction_rows(scene: Scene, model: Any, written: Iterable[tuple[int, ...]]) -> None:
-    """ValueError for a friction loss that was zero when the model was compiled: MJX laid out no row for it."""
+    """Raise ValueError for a friction loss that was zero when MJX laid out the constraint rows, which has none."""
     rows = friction_dofs(model)
     without = [i for (i, *_) in written if rows is not None and not rows[i]]
     if without:
         names = ", ".join(element_name(scene.model, "dof_frictionloss", (i,)) or f"dof {i}" for i in without)
         raise ValueError(
-            f"the environment's MJCF has no friction loss at {names}, and MJX no row for it: what is drawn would have "
-            f"no effect; give it {TINY_FRICTIONLOSS:g} or more there"
+            f"the environment's MJCF has no friction loss at {names}, so MJX has no constraint row for it and draws "
+            f"would have no effect; set it to {TINY_FRICTIONLOSS:g} or more"
         )
 
 
 def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
-    """The same values [D] in every environment: no randomisation."""
+    """A randomization_fn with the same values [D] in every environment."""
     check_space(scene, space)
 
     def randomise(sys: Physics, rng: jax.Array) -> tuple[Physics, Physics]:
@@ -144,13 +144,13 @@ def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
 
 
 def physics_of(scene: Scene, space: Space, values: np.ndarray) -> Physics:
-    """Physics of rows of values [N, D], batched where `axes` says so."""
+    """Physics of rows of values [N, D], batched along `axes`."""
     make = jax.vmap(lambda row: make_physics(scene, space, row), out_axes=axes(scene, space))
     return jax.jit(make)(jnp.asarray(values, jnp.float32))
 
 
 def axes(scene: Scene, space: Space) -> Physics:
-    """0 for what varies from row to row, None for what all share; to be handed to vmap."""
+    """The in_axes of `physics_of` for vmap: 0 for leaves that vary from row to row, None for shared ones."""
     model = _zeros(scene.mjx, _batched(scene, space))
     theta: dict[str, Any] = {p.name: 0 for p in space.parameters if not p.writes}
     return Physics(model, theta)
@@ -168,11 +168,11 @@ def _zeros(model: Any, fields: Sequence[str]) -> Any:
 
 
 def _count(rng: jax.Array) -> int:
-    """Keys in a batch of them, raw or typed."""
+    """Number of keys in a batch, raw or typed."""
     return int(rng.shape[0])
 
 
 def _seed(rng: jax.Array) -> np.random.Generator:
-    """A host generator out of a batch of keys; the same keys give the same draws."""
+    """A numpy generator from a batch of keys; the same keys give the same draws."""
     raw = jax.random.key_data(rng) if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else rng
     return np.random.default_rng(np.asarray(raw).ravel().tolist())

@@ -1,6 +1,7 @@
-"""Training: the one caller of brax's PPO.
+"""Train a policy with brax's PPO.
 
-Paper, section IV-D: actor and critic of two hidden layers of 64, tanh, Adam with a step of 1e-3, 512 actions at most.
+Paper, section IV-D: actor and critic have two hidden layers of 64 with tanh; Adam has a step size of 1e-3; an episode
+has at most 512 actions.
 """
 
 from __future__ import annotations
@@ -40,16 +41,29 @@ from droid_jax.policy.randomise import Randomise
 class TrainConfig:
     """Settings of PPO; the defaults are the preset "quick".
 
-    steps: actions in all, over all environments, rounded up to whole rounds.  envs: environments at once, over all
-    devices.  devices: how many; None for the most that divide the environments and the batch.
-    hidden: sizes of the hidden layers of actor and critic.
-    learning_rate, discount, gae, clip, entropy, reward_scaling: of PPO.
-    unroll: actions between updates; batch, minibatches: unrolls of a minibatch, and minibatches; epochs: times
-    that each is used.
-    evaluations: times that the policy is tried (and saved) while it trains; eval_envs: episodes each time.
-    enough, held: training ends where so many evaluations in a row had this success; held 0: never before its steps.
-    seed.
-    Raises ValueError for settings that do not go together.
+    Attributes:
+        steps: total number of actions over all environments, rounded up to whole rounds.
+        envs: environments in parallel, over all devices.
+        devices: number of devices; None: the most that divide `envs` and `batch`.
+        hidden: sizes of the hidden layers of actor and critic.
+        learning_rate: of Adam.
+        discount: discount factor.
+        gae: lambda of generalised advantage estimation.
+        clip: clipping range of the probability ratio.
+        entropy: weight of the entropy bonus.
+        reward_scaling: factor on rewards.
+        unroll: actions between updates.
+        batch: unrolls of a minibatch.
+        minibatches: number of minibatches.
+        epochs: number of updates with each minibatch.
+        evaluations: number of evaluations (each saves a checkpoint) during the training.
+        eval_envs: episodes of an evaluation.
+        enough: success rate that ends the training,
+        held: if so many consecutive evaluations reach it; 0: the training makes all its steps.
+        seed: of all randomness.
+
+    Raises:
+        ValueError: a value is invalid, or batch * minibatches is no multiple of envs.
     """
 
     steps: int = 4_000_000
@@ -102,12 +116,17 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class TrainProgress:
-    """After each evaluation.
+    """The state of a training after an evaluation.
 
-    step, of: actions; seconds: since training began, compilation included and pauses not; rate: actions per second
-    of the last part, its evaluation included; reward: of an episode; success, blown_up: share of episodes, the latter
-    of those that ended because the simulation was no longer one.  These count as failures here, and in no rate of
-    `Trials`: no policy shall be the best for the few episodes that it left whole.
+    Attributes:
+        step: actions so far.
+        of: total number of actions.
+        seconds: since the training began, with compilation and without pauses.
+        rate: actions per second since the last evaluation, including this one.
+        reward: mean of the episodes.
+        success: share of episodes.
+        blown_up: share of episodes whose simulation diverged.  They count as failures here (unlike in `Trials`), so
+            that a policy with few valid episodes is not selected as the best.
     """
 
     step: int
@@ -119,18 +138,20 @@ class TrainProgress:
     blown_up: float = 0.0
 
     @property
-    def left(self) -> float:
-        """s that the rest will take at this rate; infinite before the first part."""
+    def remaining(self) -> float:
+        """s that the remaining actions take at this rate; infinite before the first update."""
         return max(0, self.of - self.step) / self.rate if self.rate > 0 else float("inf")
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedPolicy:
-    """A policy and how it came to be.
+    """The result of a training.
 
-    policy: of all that were tried while it trained, the one that succeeded most, and among those the one of largest
-    reward: PPO's last update is not always its best.
-    held: training ended before its steps, since it had succeeded often enough.
+    Attributes:
+        policy: with the highest success rate in an evaluation, and among those with the highest reward.  PPO's last
+            update is not always its best.
+        history: all evaluations.
+        held: whether the training ended early (`TrainConfig.held`).
     """
 
     policy: Policy
@@ -147,12 +168,23 @@ def train(
     fingerprint: dict[str, str] | None = None,
     progress: Callable[[TrainProgress], None] = lambda now: None,
 ) -> TrainedPolicy:
-    """Train a policy on environments that `randomise` makes, all alike where it is None.
+    """Train a policy.
 
-    checkpoints: folder where the networks are kept after every evaluation, and from which an interrupted run goes on
-    (with Adam's moments and starts drawn anew, and the same doors); fingerprint: what else they belong to.
-    Raises ValueError for a checkpoint of another run or network, for more devices than there are, and where no policy
-    came of it that consists of numbers.
+    Args:
+        env: the environment.
+        randomise: draws the physics of the environments; None: all have those of `env`.
+        config: settings of PPO.
+        checkpoints: folder for the networks after each evaluation; an interrupted training continues from it, with the
+            same draws of the physics, but with new moments of Adam and new starts.
+        fingerprint: further properties that must agree with those of a checkpoint.
+        progress: is called after each evaluation.
+
+    Returns:
+        The best policy and the history.
+
+    Raises:
+        ValueError: a checkpoint belongs to another run or network, there are too few devices, or the weights of all
+            policies are NaN or infinite.
     """
     config = config or TrainConfig()
     config = replace(config, devices=_devices(config))
@@ -164,22 +196,22 @@ def train(
     run = functools.partial(_brax, env, randomise, config)
     if checkpoints is None:
         return run(None, 0, progress, lambda step, params: None)
-    with Checkpoints(checkpoints, fingerprint=texts) as kept:
-        found = kept.restore()
-        step, tree = found if found is not None else (0, None)
-        return run(tree, step, progress, kept.save)
+    with Checkpoints(checkpoints, fingerprint=texts) as saved:
+        restored = saved.restore()
+        step, tree = restored if restored is not None else (0, None)
+        return run(tree, step, progress, saved.save)
 
 
 def _devices(config: TrainConfig) -> int:
-    """How many devices to use; ValueError where they are not there or do not divide environments and batch.
+    """Number of devices to use; ValueError if there are fewer, or if it does not divide environments and batch.
 
-    brax cuts the unrolls of each device into as many minibatches as of all.
+    The batch must be divisible since brax splits the unrolls of each device into the same number of minibatches.
     """
-    there = jax.local_device_count()
+    available = jax.local_device_count()
     if config.devices is None:
-        return max(d for d in range(1, there + 1) if config.envs % d == config.batch % d == 0)
-    if not 1 <= config.devices <= there:
-        raise ValueError(f"{config.devices} devices were asked for, there are {there}")
+        return max(d for d in range(1, available + 1) if config.envs % d == config.batch % d == 0)
+    if not 1 <= config.devices <= available:
+        raise ValueError(f"{config.devices} devices were requested, there are {available}")
     for count, what in ((config.envs, "environments"), (config.batch, "unrolls of a minibatch")):
         if count % config.devices:
             raise ValueError(f"{count} {what} do not divide among {config.devices} devices")
@@ -195,13 +227,13 @@ def _brax(
     progress: Callable[[TrainProgress], None],
     save: Callable[[int, dict[str, Any]], None],
 ) -> TrainedPolicy:
-    """brax's PPO from `done` actions on, with the networks of `tree` where there are any."""
+    """Run brax's PPO after `done` actions, from the networks of a checkpoint's `tree` if there is one."""
     history = [TrainProgress(int(row[0]), *row[1:]) for row in tree["history"].tolist()] if tree else []
     began = time.monotonic() - (history[-1].seconds if history else 0.0)
     latest: Any = None
     best: Any = None
 
-    def tell(step: int, metrics: dict[str, Any]) -> None:
+    def after_evaluation(step: int, metrics: dict[str, Any]) -> None:
         nonlocal best
         seconds = time.monotonic() - began
         now = TrainProgress(
@@ -214,7 +246,7 @@ def _brax(
             blown_up=float(metrics["eval/episode_blown_up"]),
         )
         progress(now)
-        if not step:  # before the first update, or where an earlier part ended
+        if not step:  # before the first update, or at the checkpoint from which the training continues
             if not history:
                 history.append(now)
             return
@@ -228,7 +260,7 @@ def _brax(
         if _held(history, config):
             raise _Ended
 
-    def keep(step: int, _: Any, params: Any) -> None:
+    def before_evaluation(step: int, _: Any, params: Any) -> None:
         nonlocal latest
         latest = params
 
@@ -239,7 +271,8 @@ def _brax(
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps and not _held(history, config):
             with contextlib.suppress(_Ended):
-                _ppo(env, randomise, config, done, params, progress_fn=tell, policy_params_fn=keep)
+                hooks = {"progress_fn": after_evaluation, "policy_params_fn": before_evaluation}
+                _ppo(env, randomise, config, done, params, **hooks)
     if best is None:
         raise ValueError(
             "training ended in NaN or infinite weights: try another --seed "
@@ -253,7 +286,7 @@ def _brax(
 def _ppo(
     env: Environment, randomise: Randomise | None, config: TrainConfig, done: int, restore: Any, **hooks: Any
 ) -> Any:
-    """brax's own function with the settings of `config`, for what is left of its actions after `done`."""
+    """Call brax's PPO with the settings of `config`, for the actions after `done`."""
     steps = config.steps - done
     return ppo.train(
         environment=env,
@@ -285,17 +318,17 @@ def _ppo(
 
 
 class _Ended(Exception):
-    """Training is to end: it succeeds often enough, or weights are NaN or infinite, which does not go away again."""
+    """Ends a training whose success is sufficient, or whose weights are NaN or infinite."""
 
 
 def _held(history: Sequence[TrainProgress], config: TrainConfig) -> bool:
-    """Whether the last evaluations, `held` of them, each had enough success."""
+    """Whether each of the last `config.held` evaluations had sufficient success."""
     last = [now.success for now in history[-config.held :]] if config.held else []
     return len(last) == config.held > 0 and min(last) >= config.enough
 
 
 def _networks(config: TrainConfig) -> Callable[..., Any]:
-    """Actor and critic, as brax makes them of the sizes of observation and action."""
+    """brax's factory of actor and critic for given sizes of observation and action."""
     return functools.partial(
         ppo_networks.make_ppo_networks,
         policy_hidden_layer_sizes=config.hidden,
@@ -305,7 +338,7 @@ def _networks(config: TrainConfig) -> Callable[..., Any]:
 
 
 def _blank(env: Environment, config: TrainConfig) -> Any:
-    """Parameters as brax has them, (normaliser, actor, critic), to be filled."""
+    """Initial parameters in brax's form, (normaliser, actor, critic)."""
     nets, key = _networks(config)(env.observation_size, env.action_size), jax.random.key(0)
     size: Any = env.observation_size
     normaliser = running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
@@ -313,9 +346,10 @@ def _blank(env: Environment, config: TrainConfig) -> Any:
 
 
 def evaluations_left(config: TrainConfig, steps: int) -> int:
-    """Evaluations of the last `steps` actions, with the one before them that brax counts too: parts stay as long.
+    """brax's number of evaluations for the last `steps` actions, so that a continued run keeps the intervals.
 
-    Parts are whole rounds, all of as many: so many evaluations that these are hardly more than were asked for.
+    The number includes brax's evaluation before the first action.  All intervals have the same number of whole rounds,
+    so the number is chosen to exceed the requested actions as little as possible.
     """
     rounds = math.ceil(steps / (config.batch * config.minibatches * config.unroll))
     parts = max(1, round((config.evaluations - 1) * steps / config.steps))
@@ -336,32 +370,32 @@ def to_tree(params: Any) -> dict[str, Any]:
 
 
 def from_tree(blank: Any, tree: dict[str, Any]) -> Any:
-    """The inverse of `to_tree`, onto parameters of the same networks.  ValueError for those of other networks."""
+    """The inverse of `to_tree`, given parameters of the same networks; ValueError for other networks."""
     target = dict(zip(_NAMES, blank, strict=True))
     try:
-        found = flax.serialization.from_state_dict(target, tree)
+        restored = flax.serialization.from_state_dict(target, tree)
     except (KeyError, ValueError) as error:
         raise ValueError(f"the checkpoint holds another network: {error}") from None
-    for own, other in zip(jax.tree.leaves(target), jax.tree.leaves(found), strict=True):
-        if np.shape(own) != np.shape(other):
+    for expected, given in zip(jax.tree.leaves(target), jax.tree.leaves(restored), strict=True):
+        if np.shape(expected) != np.shape(given):
             raise ValueError(
-                f"the checkpoint holds a layer of shape {np.shape(other)}, this network one of {np.shape(own)}"
+                f"the checkpoint holds a layer of shape {np.shape(given)}, this network one of {np.shape(expected)}"
             )
-    return tuple(found[name] for name in _NAMES)
+    return tuple(restored[name] for name in _NAMES)
 
 
 _NAMES = ("normaliser", "actor", "critic")
 
 
 class replicated:
-    """jax.device_put_replicated while brax needs it: jax 0.10 removed it, and brax 0.14.2 calls it once.
+    """Provide jax.device_put_replicated, which jax 0.10 removed and brax 0.14.2 calls once.
 
-    A replacement with the same meaning (a leading axis over the devices); where jax still has it, nothing is touched.
+    The replacement also adds a leading axis over the devices.  Nothing is changed if jax has the function.
     """
 
     def __init__(self, module: Any = jax) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns of it, even when it is only looked for
+            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns when the attribute is looked up
             self._module, self._missing = module, not hasattr(module, "device_put_replicated")
 
     def __enter__(self) -> None:
@@ -374,7 +408,7 @@ class replicated:
 
 
 def put_replicated(tree: Any, devices: Any) -> Any:
-    """A copy of every array on every device, [devices, ...], as jax.pmap wants it."""
+    """A copy of every array on every device, [devices, ...], as jax.pmap needs it."""
     mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
     return jax.tree.map(lambda a: jax.device_put(jnp.stack([jnp.asarray(a)] * len(devices)), sharding), tree)

@@ -1,4 +1,4 @@
-"""What came of letting a policy try: success, angle, grip, with intervals."""
+"""Outcomes of a policy's trials: success, angle, grip, with intervals."""
 
 from __future__ import annotations
 
@@ -8,26 +8,31 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-# Success in one of a training's evaluations: of 80 trainings three never had it; the two that were tried on a robot all
-# the same opened no door.
+# Success rate that a training must reach in one evaluation.  Of 80 trainings three did not; two of their policies were
+# tried on a robot and opened no door.
 LEARNED = 0.95
-BLOWN_UP = "the simulation blew up"  # in `Trials.stopped`: says nothing of the policy
+BLOWN_UP = "the simulation blew up"  # in `Trials.stopped`; such trials are not counted
 
 
 def wilson(hits: int, count: int, level: float = 0.95) -> tuple[float, float]:
-    """Interval of a share, `hits` of `count`.  Wilson, JASA 1927.  ValueError for a count of 0."""
+    """Wilson's interval (JASA 1927) of a proportion, `hits` of `count`; ValueError for a count of 0."""
     span = scipy.stats.binomtest(hits, count).proportion_ci(level, method="wilson")
     return float(span.low), float(span.high)
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """One entry for each trial, N of them.
+    """Outcomes of N trials.
 
-    A trial goes on after success until its time is up, as a trial of the paper does.
-    success: [N] bool.  angle: [N] rad, the largest; steps: [N] actions until success, or all that were made;
-    grip: [N] share of actions with the knob gripped.  stopped: [N] why a trial was stopped, "" where it was not.
-    Trials whose simulation blew up say nothing of the policy: they are in no rate and in no mean.
+    A trial continues after success until its time is up, as in the paper.  Trials whose simulation diverged are not
+    counted in rates and means, since they do not depend on the policy.
+
+    Attributes:
+        success: [N] bool.
+        angle: [N] rad, largest angle of the door.
+        steps: [N] actions until success, or all actions without success.
+        grip: [N] share of actions with the knob gripped.
+        stopped: [N] why a trial was stopped; "" if it was not.
     """
 
     success: np.ndarray
@@ -38,31 +43,31 @@ class Trials:
 
     @property
     def counted(self) -> np.ndarray:
-        """[N] bool: all but those that blew up."""
+        """[N] bool, trials whose simulation did not diverge."""
         return self.stopped != BLOWN_UP
 
     def check(self) -> None:
-        """ValueError where all trials blew up."""
+        """Raise ValueError if the simulations of all trials diverged."""
         if not self.counted.any():
-            raise ValueError(f"the simulation blew up in all {len(self.success)} trials: they say nothing of a policy")
+            raise ValueError(f"the simulation blew up in all {len(self.success)} trials: the policy has no result")
 
     @property
     def rate(self) -> float:
-        """Share of trials that succeeded; ValueError where all of them blew up."""
+        """Success rate of the counted trials; ValueError if there are none."""
         self.check()
         return float(np.mean(self.success[self.counted]))
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Of the success rate (`wilson`).  ValueError where all trials blew up."""
+        """Wilson's interval of the success rate; ValueError if no trial is counted."""
         self.check()
         success = self.success[self.counted]
         return wilson(int(np.sum(success)), len(success), level)
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data, angles in degrees; trial by trial and in sum.
+        """Plain data: each trial, and statistics of the counted ones; angles in degrees.
 
-        Steps in sum are those of successes; sums are None where nothing is left to count; why trials stopped, without
-        its numbers.
+        Statistics of steps are those of successful trials.  Statistics without any trial are None.  Reasons of stops
+        are given without their numbers.
         """
         counted, degrees = self.counted, np.rad2deg(self.angle)
         some = bool(counted.any())
@@ -82,5 +87,5 @@ class Trials:
 
 
 def _spread(values: np.ndarray) -> dict[str, float | None]:
-    """Mean and deviation, None where there are no values."""
+    """Mean and standard deviation; None without values."""
     return {"mean": float(values.mean()), "std": float(values.std())} if len(values) else {"mean": None, "std": None}

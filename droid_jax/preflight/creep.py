@@ -15,7 +15,7 @@ import numpy as np
 
 from droid_jax.model.scene import SOFT_IMPEDANCE, TINY_FRICTIONLOSS, Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
-from droid_jax.simulate.initial_state import sent_columns, start_pose, weight_share
+from droid_jax.simulate.initial_state import command_columns, start_pose, weight_share
 from droid_jax.simulate.servo_gains import with_stated_gains
 
 HOLDING_SOLIMP = "0.9999 0.9999 0.001 0.5 2"  # solimpfriction that reduces the default's creep to a thousandth
@@ -139,7 +139,7 @@ def _longest_hold(scene: Scene, recording: Recording, joint: str) -> tuple[float
         seen = channel.mask[..., i].any(axis=0)
         values = np.where(channel.mask[..., i], channel.values[..., i], np.nan)[:, seen]
         return _still(channel.time[seen], np.nanmean(values, axis=0), max(STILL_WITHIN, 4.0 * _noise(recording, joint)))
-    columns = [c for u, c in sent_columns(scene, recording).items() if scene.command_names[u] == joint]
+    columns = [c for u, c in command_columns(scene, recording).items() if scene.command_names[u] == joint]
     if not columns:
         return 0.0, 0.0
     command = recording.command[:, columns[0]]
@@ -183,7 +183,7 @@ def _left_to_friction(
     for name, place in zip(scene.single_joints, map(scene.qpos, scene.single_joints), strict=True):
         if (value := _measured_at(recording, "position", name, at)) is not None:
             data.qpos[place] = value
-    for actuator, column in sent_columns(scene, recording).items():
+    for actuator, column in command_columns(scene, recording).items():
         data.ctrl[actuator] = np.interp(at, recording.time, recording.command[:, column])
         name = scene.command_names[actuator]
         if _measured_at(recording, "position", name, at) is None and name in _position_servos(scene, model):
@@ -229,7 +229,7 @@ def _seen_from(scene: Scene, recording: Recording, joint: str) -> float:
         return LEAST_CREEP
     i = channel.columns.index(joint)
     tracking = 0.0
-    for actuator, column in sent_columns(scene, recording).items():
+    for actuator, column in command_columns(scene, recording).items():
         if scene.command_names[actuator] == joint and joint in _position_servos(scene, scene.model):
             sent = np.interp(channel.time, recording.time, recording.command[:, column])
             error = channel.values[..., i] - sent / scene.model.actuator_gear[actuator, 0]

@@ -14,7 +14,7 @@ from droid_jax.preflight.clocks import GAP_STEPS
 from droid_jax.preflight.findings import Finding, Kind
 from droid_jax.preflight.preflight import check_range, command_notes, warn_if_moving
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.inverse_dynamics import prescribed
+from droid_jax.simulate.inverse_dynamics import prescribed_joints
 from droid_jax.simulate.measured_motion import CUTOFF, measured_motion
 from droid_jax.simulate.replay import make_drive
 
@@ -48,7 +48,7 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
 def _replayable(scene: Scene, recording: Recording, motion_cutoff: float) -> None:
     """Raise ValueError if the recording cannot be replayed; missing commands are reported by `_notes`."""
     if not recording.command.size:
-        measured_motion(recording, prescribed(scene, recording, motion_cutoff), cutoff=motion_cutoff)
+        measured_motion(recording, prescribed_joints(scene, recording, motion_cutoff), cutoff=motion_cutoff)
     elif set(scene.needs_command) <= set(recording.command_names):
         make_drive(scene, recording, weigh="torque" in recording.channels)
 

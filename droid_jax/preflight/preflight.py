@@ -13,7 +13,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.closed_loops import OPEN, open_loops
-from droid_jax.simulate.initial_state import sent_columns, sent_to, stated_start
+from droid_jax.simulate.initial_state import command_columns, commanded_positions, stated_start
 from droid_jax.simulate.servo_gains import gains_note
 
 START_SECONDS = 0.02  # s (six rows at least) over which the speed at the start is estimated
@@ -150,7 +150,7 @@ def check_range(scene: Scene, recording: Recording) -> None:
     Raises:
         ValueError: a position is so far outside that its unit must be wrong.
     """
-    sent = sent_to(scene, recording) if recording.command.size else {}
+    sent = commanded_positions(scene, recording) if recording.command.size else {}
     paths = [("is sent to", joint, path) for joint, path in sent.items()]
     paths += [("starts at", joint, np.array([q])) for joint, q in recording.qpos0.items()]
     if channel := recording.channels.get("position"):
@@ -208,7 +208,7 @@ def clipped_commands(scene: Scene, recording: Recording) -> str:
     if not recording.command.size or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         return ""
     said = []
-    for actuator, column in sent_columns(scene, recording).items():
+    for actuator, column in command_columns(scene, recording).items():
         if not model.actuator_ctrllimited[actuator]:
             continue
         low, high = model.actuator_ctrlrange[actuator]

@@ -8,7 +8,7 @@ import numpy as np
 
 from droid_jax.preflight.findings import Finding
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate.repeat_starts import spread
+from droid_jax.simulate.repeat_starts import start_ranges
 
 COPY_TOLERANCE = 1e-6  # of a channel's largest value: repeats that differ by less are copies (float32 rounds by less)
 COARSE_VALUES = 8  # a column that moves and has at most so many different values is coarse
@@ -93,7 +93,7 @@ def _span(channel: Channel, column: int) -> float:
 
 def _apart(recording: Recording, where: str) -> list[Finding]:
     """Note about repeats that start at visibly different positions."""
-    apart = spread(recording)
+    apart = start_ranges(recording)
     if not apart:
         return []
     most = max(apart, key=lambda joint: apart[joint])

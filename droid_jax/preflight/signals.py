@@ -15,7 +15,7 @@ import scipy
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueSide
-from droid_jax.simulate.initial_state import holding, sent_to, weight_share
+from droid_jax.simulate.initial_state import commanded_positions, holding_controls, weight_share
 
 CUTOFF = 5.0  # Hz, low-pass of all signals: joints of robots move below it, and positions are differentiated twice
 RATE = 100.0  # Hz, highest rate of the common clock
@@ -89,7 +89,9 @@ def log_motion(scene: Scene, recording: Recording) -> LogMotion | None:
         return None
     channels = {name: recording.channels[name] for name in ("torque", "position") if name in recording.channels}
     sent = (
-        {j: q for j, q in sent_to(scene, recording).items() if j in scene.single_joints} if _commands(recording) else {}
+        {j: q for j, q in commanded_positions(scene, recording).items() if j in scene.single_joints}
+        if _commands(recording)
+        else {}
     )
     clocks = [c.time for c in channels.values()] + ([recording.time] if sent else [])
     if not channels or min(len(clock) for clock in clocks) < 2:
@@ -220,7 +222,7 @@ def simulated_torques(scene: Scene, recording: Recording, motion: LogMotion) -> 
             data.qpos[scene.qpos(joint)] = path[0]
     step = float(model.opt.timestep)
     clock = np.arange(motion.time[0], min(motion.time[-1], motion.time[0] + SIMULATED_SECONDS), step)
-    control = np.tile(holding(scene, data.qpos.copy()), (len(clock), 1))
+    control = np.tile(holding_controls(scene, data.qpos.copy()), (len(clock), 1))
     for u in np.flatnonzero(has_feedback(model) & scene.of_joint):
         if scene.command_names[u] in motion.command:
             path = motion.command[scene.command_names[u]]

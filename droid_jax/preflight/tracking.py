@@ -11,7 +11,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.signals import LogMotion
 from droid_jax.recordings.recording import Recording
-from droid_jax.simulate.initial_state import sent_to
+from droid_jax.simulate.initial_state import commanded_positions
 
 LEAST_TRAVEL = 0.01  # rad or m: joints with a smaller commanded travel are not checked
 LONGEST_DELAY = 0.15  # s, largest lag of a position; no sign is checked for oscillations with a shorter half-period
@@ -48,7 +48,7 @@ def _wrapped(scene: Scene, recording: Recording, motion: LogMotion, where: str) 
     if channel := recording.channels.get("position"):
         seen = np.where(channel.mask, channel.values, np.nan)
         tracks += [("position", j, channel.time, p) for i, j in enumerate(channel.columns) for p in seen[..., i]]
-    for joint, path in (sent_to(scene, recording) if recording.command.size else {}).items():
+    for joint, path in (commanded_positions(scene, recording) if recording.command.size else {}).items():
         position = np.interp(recording.time, motion.time, motion.position.get(joint, np.full_like(motion.time, np.nan)))
         if np.std(np.unwrap(path) - position) < np.std(path - position):  # otherwise the joint does make that turn
             tracks.append(("command", joint, recording.time, path))

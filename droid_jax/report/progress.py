@@ -115,7 +115,7 @@ def training(steps: int) -> Iterator[Callable[[Any], None]]:
         task = bars.add_task("training", total=steps, text=COMPILING, left="–")
 
         def report(now: Any) -> None:
-            left = f"{now.left / 60:.0f} min" if math.isfinite(now.left) else "–"
+            left = f"{now.remaining / 60:.0f} min" if math.isfinite(now.remaining) else "–"
             bars.update(task, completed=min(now.step, steps), text=_trained(now), left=left)
 
         yield report

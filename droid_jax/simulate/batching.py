@@ -1,13 +1,13 @@
-"""A function of one parameter vector, made into a compiled batch over all devices; a loop that is cheap to batch.
+"""Compile a function of one parameter vector for batches sharded over all devices; a time loop that is cheap to batch.
 
-Rows are processed in blocks of one fixed size (on a CPU one of two), so that a program compiles once however many rows
-a stage asks for.  A block is split over the devices with shard_map; only what is wrapped here is
-sharded, search and statistics stay on one device.  In a run of several processes each does its share of the rows
+Rows are processed in blocks of one fixed size (on a CPU one of two).  So a program compiles once for any number of
+rows.  `jax.shard_map` splits a block over the devices.  Only the functions that are wrapped here are sharded; search
+and statistics run on one device.  In a run of several processes each process computes a part of the rows
 (`distributed`).
 
-`jax.vmap` of a loop over time steps traces the loop's body, then batches it again and again until it knows which of its
-values differ by row.  In `time_loop` the batch goes inside the loop, whose state differs by row throughout: the step is
-traced twice, and batched once.
+`jax.vmap` of a loop over time steps traces the loop's body and batches it repeatedly, until it knows which values
+differ by row.  `time_loop` batches the step inside the loop and treats the whole state as different by row.  So the
+step is traced twice and batched once.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from jax.sharding import PartitionSpec
 from droid_jax import distributed, runtime
 
 AXIS = "population"
-CPU_BLOCK = 32  # rows; on a CPU blocks of 64 to 512 run 12 to 25 % faster, and every smaller stage would pay for them
-MANY_BLOCK = 128  # rows, where batches always have many: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
-LARGE_BLOCK = 256  # rows, where a whole number of such blocks is asked for, as users choose populations: a fifth faster
-GPU_BLOCK = 4096  # rows at most in one piece on an accelerator
+CPU_BLOCK = 32  # rows; blocks of 64 to 512 run 12 to 25 % faster, but smaller batches would be padded to them
+MANY_BLOCK = 128  # rows, for batches that are always large: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
+LARGE_BLOCK = 256  # rows, if the batch is a multiple of it, as populations often are: a fifth faster
+GPU_BLOCK = 4096  # most rows of a block on an accelerator
 
 
 def block_size(rows: int, many: bool = False) -> int:
-    """Rows of a block: one of two sizes on a CPU, the next power of two up to GPU_BLOCK elsewhere.
+    """Rows of a block: one of two sizes on a CPU, the next power of two up to GPU_BLOCK on an accelerator.
 
-    many: the program that takes the block always gets many rows.
+    many: whether the batches of this program are always large (MANY_BLOCK in place of CPU_BLOCK).
     """
     power = 1 << max(5, (rows - 1).bit_length())
     smallest = (MANY_BLOCK if many else CPU_BLOCK) if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
@@ -43,9 +43,10 @@ def block_size(rows: int, many: bool = False) -> int:
 
 
 def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
-    """Cut [P, D] into (block [B, D], rows that count); the last block repeats its last row.
+    """Yield [P, D] in blocks: (block [B, D], number of rows that are not padding).
 
-    On a CPU blocks have LARGE_BLOCK rows where that fills them all: two programs then serve every number of rows.
+    The last block is padded with copies of its last row.  On a CPU blocks have LARGE_BLOCK rows if P is a multiple of
+    it.  So two programs serve every number of rows.
 
     Raises ValueError for an array that is not [P, D] with P >= 1.
     """
@@ -60,21 +61,21 @@ def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
         yield np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)]), len(block)
 
 
-def over_block(function: Callable[..., Any], alike: bool = True) -> Callable[..., Any]:
+def over_block(function: Callable[..., Any], shared: bool = True) -> Callable[..., Any]:
     """Compile `function` ([D], *more -> pytree) for whole blocks: [B, D], *more -> the same with a leading [B].
 
-    B must be a multiple of the number of devices (see `block_size`).  What comes after the values (pytrees of arrays)
-    is no constant of the program: other arrays of the same shapes compile nothing again.  The result lives on the
-    devices, sharded by rows.
-    alike: whether what comes after the values is shared by all rows; else each row has its own, with a leading [B].
+    B must be a multiple of the number of devices (see `block_size`).  `more` are pytrees of arrays and inputs of the
+    program: other arrays of the same shapes do not compile it again.  The result stays on the devices, sharded by rows.
+
+    shared: whether all rows share `more`; if not, its arrays have a leading [B].
     """
     rows = PartitionSpec(AXIS)
 
     def block(values: jax.Array, more: tuple[Any, ...]) -> Any:
-        return jax.vmap(function, in_axes=(0, *[None if alike else 0] * len(more)))(values, *more)
+        return jax.vmap(function, in_axes=(0, *[None if shared else 0] * len(more)))(values, *more)
 
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
-    specs = rows, PartitionSpec() if alike else rows
+    specs = rows, PartitionSpec() if shared else rows
     mapped = jax.shard_map(
         runtime.in_full(block), mesh=runtime.devices_mesh(), in_specs=specs, out_specs=rows, check_vma=False
     )
@@ -89,8 +90,9 @@ def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any
 
 
 def in_blocks(function: Callable[[np.ndarray], Any], values: Any) -> Any:
-    """`function` ([B, D] -> pytree with a leading [B]) of any number of rows [P, D], block by block: [P, ...], on the
-    host of every process.
+    """Apply `function` ([B, D] -> pytree with a leading [B]) to rows [P, D] block by block.
+
+    Returns a pytree with a leading [P], on the host of every process.
     """
     return distributed.over_processes(lambda rows: _in_blocks(function, rows), values)
 
@@ -101,13 +103,16 @@ def _in_blocks(function: Callable[[np.ndarray], Any], values: Any) -> Any:
 
 
 def time_loop(step: Callable[[Any, jax.Array, Any], Any], sample: Any, state: Any, steps: Any) -> Any:
-    """The state after `steps` time steps, a number that is an input: state = step(sample, k, state) for k = 0, 1, ...
+    """The state after `steps` time steps: state = step(sample, k, state) for k = 0, 1, ...
 
     Args:
-        step: takes what the steps of a sample share, the step's number and the state before it.
-        sample: a pytree; leaves that are no tracers stay constants of the program.
-        state: a pytree of arrays, whose shapes and types a step keeps.
-        steps: an integer, or a traced one, of which no program is special; the same for all rows of a batch.
+        step: takes the sample, the number of the step, and the state before it.
+        sample: a pytree that all steps share.  Leaves that are not traced are constants of the program.
+        state: the initial state, a pytree of arrays.  A step keeps their shapes and types.
+        steps: an integer, which may be traced; the same for all rows of a batch.
+
+    Returns:
+        A pytree like `state`.
 
     Raises:
         ValueError: rows of a batch take different numbers of steps.
@@ -115,29 +120,30 @@ def time_loop(step: Callable[[Any, jax.Array, Any], Any], sample: Any, state: An
     leaves, tree = jax.tree.flatten(sample)
     traced = [isinstance(leaf, Tracer) for leaf in leaves]
 
-    def whole(own: Any) -> Any:
-        given = iter(own)
-        return jax.tree.unflatten(tree, [next(given) if t else leaf for t, leaf in zip(traced, leaves, strict=True)])
+    def merged(inputs: Any) -> Any:
+        remaining = iter(inputs)
+        merged_leaves = [next(remaining) if t else leaf for t, leaf in zip(traced, leaves, strict=True)]
+        return jax.tree.unflatten(tree, merged_leaves)
 
     def looped(of_state: Callable[[jax.Array, Any], Any], state: Any, count: jax.Array) -> Any:
         return jax.lax.fori_loop(jnp.zeros((), jnp.int32), count, of_state, state)
 
     @custom_vmap
-    def run(own: Any, state: Any, count: jax.Array) -> Any:
-        return looped(lambda k, now: step(whole(own), k, now), state, count)
+    def run(inputs: Any, state: Any, count: jax.Array) -> Any:
+        return looped(lambda k, now: step(merged(inputs), k, now), state, count)
 
     @run.def_vmap
-    def run_rows(rows: int, batched: Any, own: Any, state: Any, count: jax.Array) -> Any:
-        of_own, of_state, of_count = batched
-        if of_count:
+    def run_rows(rows: int, batched: Any, inputs: Any, state: Any, count: jax.Array) -> Any:
+        inputs_batched, state_batched, count_batched = batched
+        if count_batched:
             raise ValueError("all rows of a batch take the same number of steps")
-        if not any(jax.tree.leaves((of_own, of_state))):  # jax.jacfwd: the primal of rows that differ in tangents alone
-            ended = looped(lambda k, now: step(whole(own), k, now), state, count)
-            return ended, jax.tree.map(lambda _: False, state)
-        begun = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (rows, *a.shape)), state, of_state)
-        axes = jax.tree.map(lambda b: 0 if b else None, of_own)
-        one = jax.vmap(lambda own, k, now: step(whole(own), k, now), in_axes=(axes, None, 0))
-        return looped(lambda k, now: one(own, k, now), begun, count), jax.tree.map(lambda _: True, state)
+        if not any(jax.tree.leaves((inputs_batched, state_batched))):  # the primal in jax.jacfwd: only tangents differ
+            last = looped(lambda k, now: step(merged(inputs), k, now), state, count)
+            return last, jax.tree.map(lambda _: False, state)
+        first = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (rows, *a.shape)), state, state_batched)
+        axes = jax.tree.map(lambda b: 0 if b else None, inputs_batched)
+        one = jax.vmap(lambda inputs, k, now: step(merged(inputs), k, now), in_axes=(axes, None, 0))
+        return looped(lambda k, now: one(inputs, k, now), first, count), jax.tree.map(lambda _: True, state)
 
-    own = [leaf for t, leaf in zip(traced, leaves, strict=True) if t]
-    return run(own, jax.tree.map(jnp.asarray, state), jnp.asarray(steps, jnp.int32))
+    inputs = [leaf for t, leaf in zip(traced, leaves, strict=True) if t]
+    return run(inputs, jax.tree.map(jnp.asarray, state), jnp.asarray(steps, jnp.int32))

@@ -1,4 +1,4 @@
-"""Plain C MuJoCo, many rollouts at once on all cores: used by the synthetic robot and by the replays in C."""
+"""Many rollouts in plain C MuJoCo at once, on all cores.  The synthetic robot and the replays in C use them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from droid_jax.model.visual_geoms import without_visual_geoms
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What a batch of C rollouts measured, at the times the states had before each step.
+    """Sensor values of a batch of C rollouts, each at the time of the state before the step.
 
-    torque [P,T,J] N m motor side; position [P,T,J]; velocity [P,T,J]; object_angle, object_velocity
-    [P,T]; contact [P,T,F] bool, per finger.
+    Attributes:
+        torque: [P, T, J] N m (N for slides), of the actuators.
+        position: [P, T, J] rad (m).
+        velocity: [P, T, J] rad/s (m/s).
+        object_angle: [P, T] rad (m), of the object's joint; 0 without one.
+        object_velocity: [P, T] rad/s (m/s).
+        contact: [P, T, F] bool, whether a finger touches the object.
     """
 
     torque: np.ndarray
@@ -33,11 +38,11 @@ class Trace:
 def instrument(scene: Scene) -> mujoco.MjModel:
     """The scene's C model with sensors for everything in `Trace`.
 
-    Recompiled from the scene's spec, then given the scene's own numbers, so that options and
-    fields changed after compilation are kept.
+    It is compiled from the scene's spec, then takes over the numbers of the scene's model.  So options and fields that
+    were changed after compilation keep their values.
     """
     spec = without_visual_geoms(scene.spec)
-    for sensor in list(spec.sensors):  # the file's own would stand before ours
+    for sensor in list(spec.sensors):  # `split` counts on the order of the sensors that are added here
         spec.delete(sensor)
     for kind in ("JOINTACTFRC", "JOINTPOS", "JOINTVEL"):
         for joint in scene.joints:
@@ -72,9 +77,9 @@ def _copy_numbers(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
         if name.startswith(("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")):
             array = getattr(source, name)
             if isinstance(array, np.ndarray) and array.size and np.issubdtype(array.dtype, np.number):
-                mine = getattr(target, name)
-                if mine.shape == array.shape and not name.endswith(("adr", "id", "num")):
-                    mine[:] = array
+                copied = getattr(target, name)
+                if copied.shape == array.shape and not name.endswith(("adr", "id", "num")):
+                    copied[:] = array
     target.jnt_limited[:] = source.jnt_limited
     target.stat.meaninertia, target.stat.meanmass = source.stat.meaninertia, source.stat.meanmass
 
@@ -87,7 +92,7 @@ def simulate(
 ) -> Trace:
     """Roll out instrumented models [P] from qpos0 [P or 1, nq] under control [P or 1, T, U].
 
-    Where a rollout blows up, everything from there on is NaN (and no contact).
+    From the step at which a rollout diverges, its values are NaN and its contacts False.
     """
     threads = min(runtime.cores(), len(models))
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -100,14 +105,14 @@ def simulate(
     with rollout.Rollout(nthread=threads) as pool:
         datas = [mujoco.MjData(models[0]) for _ in range(threads)]
         after, sensors = pool.rollout(list(models), datas, states, np.ascontiguousarray(control))
-    # MuJoCo repeats the last good state to the end, or starts over: in either case its clock is wrong.
+    # A rollout that diverges repeats its last valid state or starts again.  Either way its clock is wrong.
     steps = np.array([m.opt.timestep for m in models])[:, None]
-    late = np.abs(after[..., 0] - np.arange(1, after.shape[1] + 1) * steps) > 0.5 * steps
-    return split(scene, np.where(np.logical_or.accumulate(late, axis=1)[..., None], np.nan, sensors))
+    diverged = np.abs(after[..., 0] - np.arange(1, after.shape[1] + 1) * steps) > 0.5 * steps
+    return split(scene, np.where(np.logical_or.accumulate(diverged, axis=1)[..., None], np.nan, sensors))
 
 
 def split(scene: Scene, sensors: np.ndarray) -> Trace:
-    """Sensor rows [P, T, S] of an instrumented model as a Trace."""
+    """Sensor values [P, T, S] of an instrumented model as a Trace."""
     count = len(scene.joints)
     torque, position, velocity = (sensors[..., k * count : (k + 1) * count] for k in range(3))
     rest = sensors[..., 3 * count :]
@@ -123,7 +128,7 @@ def split(scene: Scene, sensors: np.ndarray) -> Trace:
 
 
 def poses(model: mujoco.MjModel, qpos0: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """[T, nq] every joint position of one C rollout, for drawing."""
+    """[T, nq] positions of all joints in one C rollout from qpos0 [nq] under control [T, U], for drawing."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos0
     out = np.empty((len(control), model.nq))

@@ -1,7 +1,7 @@
-"""The counterpart of the replays in C: the same commands or motions, values and outputs through plain C MuJoCo.
+"""The replays in plain C MuJoCo: the same inputs and outputs as those in MJX.
 
-It is the parity oracle, the CPU benchmark, and the engine of `--engine mujoco`.  Of effects it knows those
-that write model fields, what a servo makes of its whole command, and the torque offsets; everything else needs MJX.
+They are the reference of the parity tests, the CPU benchmark, and the engine of `--engine mujoco`.  They support
+effects that write model fields, profiles of servos (`Effect.profile`) and torque offsets.  Other effects need MJX.
 """
 
 from __future__ import annotations
@@ -26,17 +26,27 @@ from droid_jax.simulate.inverse_dynamics import Path, PathTorques
 from droid_jax.simulate.replay import Drive, check_stateless, profiled
 from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
-CHUNK = 64  # samples whose traces of the whole state are held at once
+CHUNK = 64  # samples whose full states are in memory at once
 
 
 def c_replay(
     scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect] = (), *, late: float = 0.5
 ) -> Callable[[np.ndarray], Rollout]:
-    """values [P, D] -> Rollout with a leading [P], float64, on all cores.
+    """A batch of servo replays in plain C: values [P, D] -> Rollout with a leading [P], float64, on all cores.
 
-    late: steps by which commands come late, and positions and velocities are told ahead, which takes most of the
-    first-order error of C's steps out; 0 for what mj_step itself logs.
-    Raises ValueError where `why_not_in_c` says something.
+    Args:
+        scene: what is simulated.
+        space: meaning of the values [D].
+        drive: the commands.
+        effects: in the replay.
+        late: steps by which commands are delayed, and by which positions and velocities are extrapolated.  Half a step
+            removes most of the first-order error of C's integrators.  0 gives what mj_step itself logs.
+
+    Returns:
+        The batch, a function of the values.
+
+    Raises:
+        ValueError: plain C cannot replay this (`why_not_in_c`).
     """
     check_gains(scene, drive)
     check_stateless(scene)
@@ -70,7 +80,7 @@ def c_replay(
 
     def replay(values: np.ndarray) -> Rollout:
         values = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        rows, again = np.unique(values, axis=0, return_inverse=True)  # blocks are filled up with copies
+        rows, again = np.unique(values, axis=0, return_inverse=True)  # blocks are padded with copies of a row
         pieces = [piece(rows[i : i + CHUNK]) for i in range(0, len(rows), CHUNK)]
         fields = Rollout.__dataclass_fields__
         return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces])[again.ravel()] for f in fields})
@@ -79,15 +89,15 @@ def c_replay(
 
 
 def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
-    """Why plain C cannot replay a commanded recording; empty where it can.
+    """Why plain C cannot replay a commanded recording; empty if it can.
 
-    The C batch interface returns the actuators' torque alone, and runs no effect with functions of its own.
+    MuJoCo's batch interface returns the torques of the actuators only, and cannot call functions of effects.
 
     Args:
         scene: what is simulated.
         space: the parameters.
-        torque: what the recording's torque is.
-        effects: in the replay, those of the torque offsets apart.
+        torque: the torque convention of the recording.
+        effects: in the replay, without those of the torque offsets.
     """
     functions = ("command", "servo", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
@@ -96,18 +106,18 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         return f"C does not have {', '.join(p.name for p in sensed)}"
     weight = scene.model.body_gravcomp.any() and weight_share(scene.model, scene.joint_dofs, torque.gravity).any()
     if torque.side is TorqueSide.LINK or weight:
-        return "its torque is the actuators': motor-side, and without gravity where the scene compensates it"
+        return "it gives actuator torques: motor-side, and without the gravity that the scene compensates"
     if scene.model.body_gravcomp.any() and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
-        return "it compensates gravity where joints are, not where encoders say"
+        return "it compensates gravity at the true joint positions, not at those that encoders read"
     return ""
 
 
 def c_path_torques(
     scene: Scene, space: Space, convention: TorqueConvention, joints: Sequence[str]
 ) -> Callable[[np.ndarray, Path], PathTorques]:
-    """values [P, D], path -> what the path takes of the scene's joints, [P, T, J], double precision.
+    """A batch of inverse dynamics in plain C: values [P, D], path -> torques of the scene's joints [P, T, J], float64.
 
-    The equation is that of `path_replay`.  Each set of model fields is computed once, whatever the sensors are.
+    The equation is that of `path_replay`.  Rows that differ in sensor parameters only share one computation.
     """
     dofs, positions = [scene.dof(j) for j in joints], [scene.qpos(j) for j in joints]
     motor, of_joints = convention.side is TorqueSide.MOTOR, scene.joint_dofs
@@ -134,35 +144,35 @@ def c_path_torques(
             mujoco.mj_fullM(model, data, mass)
             force = mass @ acceleration + data.qfrc_bias - data.qfrc_spring - data.qfrc_damper
             torques[k], inertias[k] = force[of_joints], np.diagonal(mass)[of_joints]
-        own = model.dof_frictionloss[of_joints] if motor else np.zeros(len(of_joints))
-        return torques + own * np.sign(np.asarray(path.velocity)[:, : len(of_joints)]), inertias, own
+        loss = model.dof_frictionloss[of_joints] if motor else np.zeros(len(of_joints))
+        return torques + loss * np.sign(np.asarray(path.velocity)[:, : len(of_joints)]), inertias, loss
 
     def torques_of(values: np.ndarray, path: Path) -> PathTorques:
         values = np.atleast_2d(np.asarray(values, np.float64))
         first, again = np.unique(values[:, columns], axis=0, return_index=True, return_inverse=True)[1:]
-        found = [of_model(values[i], path) for i in first]
-        torque, inertia, own = (np.stack([f[k] for f in found])[again.ravel()] for k in range(3))
-        behind = np.array(
+        computed = [of_model(values[i], path) for i in first]
+        torque, inertia, model_loss = (np.stack([c[k] for c in computed])[again.ravel()] for k in range(3))
+        sensor_loss = np.array(  # dry friction between the sensor and the link
             [[theta_of(space, row).get(Role.COULOMB.in_theta(j), 0.0) for j in scene.joints] for row in values]
         )
-        loss = np.broadcast_to((own + behind)[:, None], torque.shape)
+        loss = np.broadcast_to((model_loss + sensor_loss)[:, None], torque.shape)
         return PathTorques(torque, loss, inertia)
 
     return torques_of
 
 
-def why_no_path_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
-    """Why plain C cannot replay a measured motion; empty where it can.  The arguments are those of `why_not_in_c`."""
+def why_no_path_in_c(space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
+    """Why plain C cannot replay a measured motion; empty if it can.  The arguments are those of `why_not_in_c`."""
     functions = ("command", "servo", "profile", "force", "frictionloss")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     if not torque.gravity and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
-        return "the weight was taken out where encoders say, not where joints are"
+        return "the robot subtracted gravity at the positions that encoders read, not at the true ones"
     return ""
 
 
 def _later(velocity: np.ndarray, late: float) -> np.ndarray:
-    """[P, T, J] velocities `late` steps ahead, the last one on a line: C's are half a step behind its positions."""
+    """[P, T, J] velocities `late` steps later, the last one extrapolated: C's are half a step behind its positions."""
     after = np.concatenate([velocity[:, 1:], 2 * velocity[:, -1:] - velocity[:, -2:-1]], axis=1)
     return velocity + late * (after - velocity)
 
@@ -170,23 +180,23 @@ def _later(velocity: np.ndarray, late: float) -> np.ndarray:
 def control_of(
     drive: Drive, command: np.ndarray | None = None, time_offset: float = 0.0, late: float = 0.5
 ) -> np.ndarray:
-    """[T, U] the command, of the drive unless given, so many steps (and the time offset) late."""
+    """[T, U] the drive's command (or the given one), delayed by `late` steps and by the time offset [s]."""
     at = drive.time - late * drive.timestep - time_offset
     return interpolate(at, drive.time, drive.command if command is None else command)
 
 
 def _profiles(drive: Drive, effects: Sequence[Effect]) -> Callable[[Sequence[dict[str, float]]], Sequence[np.ndarray]]:
-    """Parameters of P samples -> commands [T, U] that their servos make of the drive's."""
-    drawing = [e for e in effects if e.profile is not None]
-    if not drawing:
+    """A function of P samples' parameters: the commands [T, U] after the servos' profiles (`Effect.profile`)."""
+    profiles = [e for e in effects if e.profile is not None]
+    if not profiles:
         return lambda thetas: [np.asarray(drive.command)] * len(thetas)
     table = jnp.asarray(drive.command, jnp.float32)
-    each = jax.jit(jax.vmap(lambda theta: profiled(table, drive.timestep, complete(theta, drawing), drawing)))
-    read = {p.name for e in drawing for p in e.parameters}
+    each = jax.jit(jax.vmap(lambda theta: profiled(table, drive.timestep, complete(theta, profiles), profiles)))
+    read = {p.name for e in profiles for p in e.parameters}
 
     def sent(thetas: Sequence[dict[str, float]]) -> Sequence[np.ndarray]:
-        wide = [*thetas, *[thetas[-1]] * (-len(thetas) % CHUNK)]  # compiled for one number of samples
-        given = {name: jnp.array([t[name] for t in wide]) for name in read if name in wide[0]}
+        padded = [*thetas, *[thetas[-1]] * (-len(thetas) % CHUNK)]  # one number of samples compiles once
+        given = {name: jnp.array([t[name] for t in padded]) for name in read if name in padded[0]}
         if not given:
             return [np.asarray(drive.command)] * len(thetas)
         return list(np.asarray(each(given), np.float64)[: len(thetas)])

@@ -1,5 +1,8 @@
-"""Closed kinematic loops (connected, welded, coupled bodies) and floating bases at the start of a motion: how far loops
-stand open there and where the joints that nobody commands or measures close them; whether anything holds a base."""
+"""Closed kinematic loops and floating bases at the start of a motion.
+
+Equalities (connect, weld, joint, tendon) that the start violates are closed by the joints that nobody commands or
+measures.  A floating base that nothing supports is refused.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,13 @@ import numpy as np
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
-OPEN = 0.01  # rad or m that joints must move to close a loop: as far apart as repeats may begin (`StartConfig.scatter`)
-EXACT = 1e-6  # m or rad: a loop open by less is closed
-STAGES = 20  # from the scene's pose to where the motion starts, so that a linkage stays on its branch
-ITERATIONS = 30  # of Gauss-Newton at each stage
+OPEN = 0.01  # rad or m, largest motion of a joint that may close a loop; the scatter of starts (`StartConfig.scatter`)
+EXACT = 1e-6  # m or rad, an equality with a smaller error counts as satisfied
+STAGES = 20  # from the scene's pose to the start, so that a linkage stays on its branch
+ITERATIONS = 30  # of Gauss-Newton in each stage
+HOLD_DURATION = 0.3  # s, for which the servos hold the start pose in the test of a floating base: free fall is 0.44 m
+FALL_LIMIT = 0.1  # m, a floating body that moves further in that time is not held
+TURN_LIMIT = 0.3  # rad, likewise
 _KINDS = {
     mujoco.mjtEq.mjEQ_CONNECT: "connect",
     mujoco.mjtEq.mjEQ_WELD: "weld",
@@ -26,9 +32,12 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class Loop:
-    """An equality that a pose does not fulfil.
+    """An equality that a pose violates.
 
-    name: in words.  gap: distance, m or rad.  turn: the most that a joint moves where all together close it, rad or m.
+    Attributes:
+        name: of the equality, for messages.
+        gap: norm of its error, m or rad.
+        turn: rad or m, largest motion of a joint in the smallest joint motion that closes it.
     """
 
     name: str
@@ -37,9 +46,9 @@ class Loop:
 
 
 def open_loops(scene: Scene, qpos: np.ndarray) -> list[Loop]:
-    """The active equalities that a pose [nq] leaves open by more than EXACT, the widest first.
+    """The active equalities that a pose [nq] violates by more than EXACT, the largest `turn` first.
 
-    The distance is the norm of an equality's rows: m (of a weld with the sines of half its angles), rad of hinges.
+    An equality's error is the norm of its rows: m (a weld adds the sines of half its angles), or rad for hinges.
     """
     model = _of_equalities(scene.model)
     if model is None:
@@ -55,35 +64,35 @@ def open_loops(scene: Scene, qpos: np.ndarray) -> list[Loop]:
     return sorted(found, key=lambda loop: -loop.turn)
 
 
-def closed(scene: Scene, qpos: np.ndarray, fixed: Iterable[int]) -> np.ndarray:
-    """[nq] the pose in which the joints that are free to move come closest to fulfilling the scene's equalities.
+def close_loops(scene: Scene, qpos: np.ndarray, fixed: Iterable[int]) -> np.ndarray:
+    """[nq] the pose in which the free joints come closest to satisfying the scene's equalities.
 
-    Gauss-Newton on the free joints, in STAGES from the scene's own pose on, whose loops the compiler closed.
+    Gauss-Newton moves the free joints, in STAGES from the scene's reference pose, whose loops the compiler closed.
 
     Args:
         scene: with the equalities.
         qpos: [nq] the pose, rad and m.
-        fixed: position addresses of the joints of one degree that stay where they are.
+        fixed: position addresses of hinges and slides that must not move.
     """
     model = _of_equalities(scene.model)
     if model is None or not open_loops(scene, qpos):
         return qpos
-    kept = sorted(set(fixed))
-    still = np.isin(scene.model.jnt_qposadr[scene.model.dof_jntid], kept)
-    data, pose = mujoco.MjData(model), model.qpos0.copy()
-    begin = pose.copy()
+    addresses = sorted(set(fixed))
+    fixed_dofs = np.isin(scene.model.jnt_qposadr[scene.model.dof_jntid], addresses)
+    data, staged = mujoco.MjData(model), model.qpos0.copy()
+    reference = staged.copy()
     for stage in np.arange(1, STAGES + 1) / STAGES:
-        pose[kept] = begin[kept] + stage * (qpos[kept] - begin[kept])
-        pose = _closest(model, data, pose, ~still)
-    found = _closest(model, data, qpos, ~still)
-    here, there = (float(np.linalg.norm(_equalities(model, data, p)[1])) for p in (pose, found))
-    best = pose if here <= there + EXACT else found  # where the scene's own pose is no start, the given one may be
+        staged[addresses] = reference[addresses] + stage * (qpos[addresses] - reference[addresses])
+        staged = _closest(model, data, staged, ~fixed_dofs)
+    direct = _closest(model, data, qpos, ~fixed_dofs)
+    errors = [float(np.linalg.norm(_equalities(model, data, pose)[1])) for pose in (staged, direct)]
+    best = staged if errors[0] <= errors[1] + EXACT else direct  # the way from the reference pose may end elsewhere
     touched = np.isin(scene.model.dof_jntid, scene.model.dof_jntid[_of_loops(model, data, best)])
-    return _only(scene.model, qpos, best, touched & ~still)
+    return _only(scene.model, qpos, best, touched & ~fixed_dofs)
 
 
 def moved_by_loops(scene: Scene, qpos: np.ndarray) -> set[int]:
-    """Position addresses of joints of one degree that connected or welded bodies hold in a pose [nq]."""
+    """Position addresses of hinges and slides on which a connect or weld equality acts in a pose [nq]."""
     model = _of_equalities(scene.model)
     if model is None:
         return set()
@@ -95,23 +104,23 @@ def moved_by_loops(scene: Scene, qpos: np.ndarray) -> set[int]:
 
 
 def coupled_to_others(scene: Scene, joints: Iterable[str]) -> list[str]:
-    """Names of the equalities that join a measured joint of the scene to joints that are not among these."""
+    """Names of the equalities that couple a measured joint of the scene to a joint that is not in `joints`."""
     model = _of_equalities(scene.model)
     if model is None:
         return []
     ids, _, jacobian = _equalities(model, mujoco.MjData(model), model.qpos0)
     known = np.zeros(model.nv, bool)
     known[[scene.dof(joint) for joint in joints]] = True
-    found = []
+    names = []
     for i in np.unique(ids):
-        felt = np.any(jacobian[ids == i] != 0, axis=0)
-        if felt[scene.joint_dofs].any() and felt[~known].any():
-            found.append(_called(model, int(i)))
-    return found
+        coupled = np.any(jacobian[ids == i] != 0, axis=0)
+        if coupled[scene.joint_dofs].any() and coupled[~known].any():
+            names.append(_called(model, int(i)))
+    return names
 
 
 def _of_equalities(model: mujoco.MjModel) -> mujoco.MjModel | None:
-    """The model with no constraint but its equalities, in dense rows; None where it has none."""
+    """A copy of the model with its equalities as the only constraints, in dense rows; None if it has none."""
     off = mujoco.mjtDisableBit.mjDSBL_EQUALITY | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     if not model.neq or not model.eq_active0.any() or model.opt.disableflags & off:
         return None
@@ -125,7 +134,7 @@ def _of_equalities(model: mujoco.MjModel) -> mujoco.MjModel | None:
 def _equalities(
     model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[E] equality of each row, [E] its error, [E, nv] its derivative, in a pose [nq]."""
+    """Of each constraint row in a pose [nq]: [E] its equality, [E] its error, [E, nv] its Jacobian."""
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)
     rows = np.asarray(data.efc_J).reshape(-1, model.nv)[: data.ne]
@@ -133,12 +142,12 @@ def _equalities(
 
 
 def _of_loops(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> np.ndarray:
-    """Velocity addresses that some equality feels."""
+    """Velocity addresses on which an equality acts."""
     return np.flatnonzero(np.any(_equalities(model, data, qpos)[2] != 0, axis=0))
 
 
 def _closest(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """[nq] where Gauss-Newton on the free [nv] degrees of freedom ends, each step halved until the error falls."""
+    """[nq] the result of Gauss-Newton on the free degrees of freedom [nv]; steps are halved until the error falls."""
     pose = qpos.copy()
     _, errors, jacobian = _equalities(model, data, pose)
     for _ in range(ITERATIONS):
@@ -159,7 +168,7 @@ def _closest(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, free:
 
 
 def _only(model: mujoco.MjModel, qpos: np.ndarray, other: np.ndarray, dofs: np.ndarray) -> np.ndarray:
-    """[nq] a pose with the joints of some degrees of freedom [nv] as another one has them."""
+    """[nq] a pose with the joints of some degrees of freedom [nv] taken from another pose."""
     pose = qpos.copy()
     widths = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
     for joint in np.unique(model.dof_jntid[dofs]):
@@ -170,7 +179,7 @@ def _only(model: mujoco.MjModel, qpos: np.ndarray, other: np.ndarray, dofs: np.n
 
 
 def _called(model: mujoco.MjModel, index: int) -> str:
-    """An equality in words: its name, or its kind and what it joins."""
+    """An equality for messages: its name, or its kind and what it couples."""
     kind = _KINDS.get(mujoco.mjtEq(model.eq_type[index]), "equality")
     if name := mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_EQUALITY, index):
         return f"<{kind}> {name!r}"
@@ -181,23 +190,18 @@ def _called(model: mujoco.MjModel, index: int) -> str:
     return f"<{kind}> of {' and '.join(mujoco.mj_id2name(model, what, i) or str(i) for i in ends)}"
 
 
-WATCHED = 0.3  # s, for which the servos hold the start pose: what nothing holds falls 0.44 m in it
-FALLEN = 0.1  # m by which a floating body moves then, at least, where what touches it does not hold it
-TURNED = 0.3  # rad, likewise
-
-
 def refuse_floating(scene: Scene, recording: Recording, qpos0: np.ndarray, control: np.ndarray) -> None:
-    """Raise ValueError where a free or ball joint carries measured or commanded joints and nothing holds it.
+    """Raise ValueError if a free or ball joint carries measured or commanded joints and nothing holds it.
 
-    A robot that hung or was clamped when it was recorded falls in the replay if its MJCF floats.  What may hold a
-    joint is an equality, an actuator, a spring, dry friction or a contact; whether it does is tried in the C engine,
-    with the servos at the start.
+    A robot that hung or was clamped in reality falls in the replay if its MJCF floats.  An equality, an actuator, a
+    spring, dry friction or a contact may hold a joint.  The C engine tests whether they do: the servos hold the start
+    pose for HOLD_DURATION.
 
     Args:
         scene: with the joint.
-        recording: that is to be replayed.
+        recording: to be replayed.
         qpos0: [nq] start pose, rad and m.
-        control: [U] controls that hold it.
+        control: [U] controls that hold the start pose.
     """
     commanded = [j for j in recording.command_names if j in scene.single_joints]
     floating = scene.floating_ids(dict.fromkeys((*scene.joints, *commanded)))
@@ -207,26 +211,27 @@ def refuse_floating(scene: Scene, recording: Recording, qpos0: np.ndarray, contr
     data = mujoco.MjData(model)
     data.qpos[:], data.ctrl[:] = qpos0, control
     mujoco.mj_forward(model, data)
-    held = {joint: _may_hold(model, data, joint) for joint in floating}
-    begin = {joint: _place(model, data, joint) for joint in floating}
-    for _ in range(max(1, round(WATCHED / model.opt.timestep))):
+    supported = {joint: _may_hold(model, data, joint) for joint in floating}
+    begin = {joint: _pose(model, data, joint) for joint in floating}
+    for _ in range(max(1, round(HOLD_DURATION / model.opt.timestep))):
         mujoco.mj_step(model, data)
-        held = {joint: found or _touches(model, data, joint) for joint, found in held.items()}
-    for joint, found in held.items():
-        place, turned = _place(model, data, joint)
-        fallen = float(np.linalg.norm(place - begin[joint][0]))
-        angle = np.zeros(3)
-        mujoco.mju_subQuat(angle, turned, begin[joint][1])
-        away = fallen > FALLEN or float(np.linalg.norm(angle)) > TURNED
-        if found and not away:
+        supported = {joint: before or _touches(model, data, joint) for joint, before in supported.items()}
+    for joint, has_support in supported.items():
+        position, quaternion = _pose(model, data, joint)
+        fall = float(np.linalg.norm(position - begin[joint][0]))
+        rotation = np.zeros(3)
+        mujoco.mju_subQuat(rotation, quaternion, begin[joint][1])
+        turn = float(np.linalg.norm(rotation))
+        moved = fall > FALL_LIMIT or turn > TURN_LIMIT
+        if has_support and not moved:
             continue
         free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
-        moves = f"it moves by {fallen:.2g} m and turns by {np.linalg.norm(angle):.2g} rad within {WATCHED:g} s"
+        reason = f"it moves by {fall:.2g} m and turns by {turn:.2g} rad within {HOLD_DURATION:g} s"
         raise ValueError(
-            f"recording {recording.name!r} holds commands, and nothing in scene {scene.name!r} holds the "
+            f"recording {recording.name!r} has commands, and nothing in scene {scene.name!r} holds the "
             f"{'free' if free else 'ball'} joint {scene.joint_called(joint)}, which carries measured joints: "
-            f"{moves if away else 'whatever the commands do moves it'}; where the robot was clamped or hung, weld it "
-            "to the world (take that joint out of the MJCF)"
+            f"{reason if moved else 'every command moves it'}; if the robot was clamped or hung, weld it to the world "
+            "(remove that joint from the MJCF)"
         )
 
 
@@ -268,7 +273,7 @@ def _acts(model: mujoco.MjModel, data: mujoco.MjData, joint: int, *kinds: mujoco
     return bool(np.any(dense[rows, _dofs(model, joint)] != 0))
 
 
-def _place(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """[3] m and [4] quaternion of the body that a joint moves."""
+def _pose(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """[3] m, centre of mass, and [4] quaternion of the body that a joint moves."""
     body = int(model.jnt_bodyid[joint])
     return data.xipos[body].copy(), data.xquat[body].copy()

@@ -1,9 +1,9 @@
-"""Replays compiled in batches; each program is made once for all that differ in nothing but numbers.
+"""Compiled batches of replays; replays that differ in numbers only share one program.
 
-Tracing and compiling a replay takes longer than most fits replay.  A program depends on the scene, on what a row of
-values writes and on the effects; commands, their number, starts and measured motions are handed to it.  So recordings
-of any length, their held-out repeats and every search over them share one.  What the sensors make of a motion is a
-second, small program of the motion's own length.
+Compiling a replay takes longer than the replays of most fits.  A program depends on the scene, on the fields that a row
+of values writes, and on the effects.  Commands, their number, starts and measured motions are its inputs.  So
+recordings of any length, their held-out repeats and every search over them share one program.  The sensor model is a
+second, small program for each length of a motion.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from droid_jax.simulate.replay import (
     TORQUE_OFFSETS,
     Drive,
     Replay,
-    sensed,
     servo_motion,
     torque_offset_effect,
     traced_part,
+    with_sensor_model,
 )
 from droid_jax.simulate.servo_gains import check_gains
 
-PROGRAMS = 16  # of each kind, kept for whoever asks for the same again; each holds its scene
-SHORTEST = 8192  # rows of a motion's program, at least: 16 s at 2 ms
+PROGRAMS = 16  # most programs of each kind in the cache; each holds its scene
+MIN_ROWS = 8192  # least rows of a motion's program: 16 s at 2 ms
 
 Batch = Callable[[np.ndarray], Rollout]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What a row of values is written to: spaces that differ in means, deviations or bounds alone have the same."""
+    """The part of a space that a program depends on: names, roles and written fields, not means, widths or bounds."""
 
     entries: tuple[tuple[str, Role, tuple[Write, ...]], ...]
     space: Space = field(compare=False)
@@ -57,7 +57,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Clocked:
-    """What a servo program must know of a drive: the same of all drives on one clock, torques of one convention."""
+    """The part of a drive that a servo program depends on: the time step and the torque convention."""
 
     timestep: float
     torque: TorqueConvention
@@ -66,9 +66,9 @@ class Clocked:
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """A compiled batch of inverse replays along a motion: [B, D] -> Rollout [B, ...].
+    """A batch of inverse-dynamics replays along a measured motion: [B, D] -> Rollout [B, ...].
 
-    torques: the torques [N, T, J] of N paths at the space's means.
+    torques: a function of N paths; their torques [N, T, J], N m, at the space's means.
     """
 
     compiled: Callable[..., Rollout]
@@ -86,8 +86,8 @@ class Along:
 class Driven:
     """A batch of servo replays of a drive: [B, D] -> Rollout [B, ...].
 
-    make: drive -> its batch; one of another start, other gains, or other commands of the same length, compiles nothing
-    again.
+    make: drive -> its batch.  A drive with another start, other gains, or other commands of the same length shares the
+    compiled program.
     """
 
     make: Callable[[Drive], Batch]
@@ -102,7 +102,7 @@ class Driven:
 
 
 def along_another(replay: Batch, follows: Drive | Motion) -> Batch:
-    """The same compiled batch along another motion, or of another drive."""
+    """The same compiled batch for another measured motion or another drive."""
     if isinstance(replay, Along) and isinstance(follows, Motion):
         return replace(replay, motion=follows)
     if isinstance(replay, Driven) and isinstance(follows, Drive):
@@ -113,7 +113,7 @@ def along_another(replay: Batch, follows: Drive | Motion) -> Batch:
 def compiled_replay(
     engine: str, scene: Scene, space: Space, follows: Drive | Motion, effects: Sequence[Effect], mj_step: bool = False
 ) -> Batch:
-    """Batches [B, D] -> Rollout [B, ...] of what a replay follows.
+    """A batch of replays of a drive or a measured motion: [B, D] -> Rollout [B, ...].
 
     Args:
         engine: "mjx" (compiled, all devices) or "mujoco" (plain C, all cores).
@@ -124,12 +124,12 @@ def compiled_replay(
         mj_step: step as the C engine does.
 
     Raises:
-        ValueError: a measured motion with mj_step, what plain C does not have, gains that the scene does not have, a
-            model that was changed since MJX had it, or a known value of a parameter that the space does not have or
-            bounds.
+        ValueError: a measured motion with mj_step, a replay that plain C does not support, gains for actuators that
+            are no position servos, a model that was changed after MJX got it, or a known value of a parameter that
+            the space does not have or that is out of its bounds.
     """
     scene.check_unchanged()
-    space.with_known(follows.known, space.mean)  # refused here, not at the first call
+    space.with_known(follows.known, space.mean)  # raise here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
         if mj_step:
@@ -168,10 +168,19 @@ def compiled_replay(
 def window_program(
     scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect], earlier: int, steps: int
 ) -> Callable[..., Rollout]:
-    """(values [B, D], command [B, earlier + steps, U], start [B, nq], gains [B, U, 2], speed [B, nv], origin [B]) ->
-    Rollout [B, steps, ...]: every row a window of its own, from its own state (`servo_motion`).
+    """A compiled batch of windows; every row is one window with its own initial state (`servo_motion`).
 
-    Of the drive only its time step and its torque's convention are used.
+    Args:
+        scene: what is simulated.
+        space: meaning of the values [D].
+        drive: of which only the time step and the torque convention are used.
+        effects: in the replay; those of the sensors are added.
+        earlier: commands before the first step.
+        steps: time steps of a window.
+
+    Returns:
+        (values [B, D], command [B, earlier + steps, U], start [B, nq], gains [B, U, 2], speed [B, nv], origin [B]) ->
+        Rollout [B, steps, ...].
     """
     scene.check_unchanged()
     check_gains(scene, drive)
@@ -190,46 +199,46 @@ def _window_program(
     def replay(values: jax.Array, table: Any, start: Any, gains: Any, speed: Any, origin: Any) -> Rollout:
         physics = make_physics(scene, space, values)
         moved = motion(physics, table, start, gains, steps, speed, origin)
-        return sensed(moved, physics.theta, effects, clocked.timestep, origin=origin)
+        return with_sensor_model(moved, physics.theta, effects, clocked.timestep, origin=origin)
 
-    return over_block(_of_bodies(scene, space, replay), alike=False)
+    return over_block(_of_bodies(scene, space, replay), shared=False)
 
 
 def batch_replay(scene: Scene, space: Space, replay: Replay) -> Batch:
-    """One compiled, sharded block of a per-sample replay of your own: [B, D] -> Rollout [B, ...]."""
+    """Compile your own per-sample replay into a sharded batch: [B, D] -> Rollout [B, ...]."""
     return over_block(_of_bodies(scene, space, lambda values: replay(make_physics(scene, space, values))))
 
 
 def capacity(steps: int) -> int:
-    """Rows of a program for that many steps: few different numbers, so that recordings share it."""
-    return max(SHORTEST, 1 << (steps - 1).bit_length())
+    """Rows of a program for that many steps: a power of two, so that recordings of different lengths share it."""
+    return max(MIN_ROWS, 1 << (steps - 1).bit_length())
 
 
 def layout_of(space: Space) -> Layout:
-    """What a program must know of a space."""
+    """The part of a space that a program depends on."""
     return Layout(tuple((p.name, p.role, p.writes) for p in space.parameters), space)
 
 
 def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The effects, and those of the torque sensors that are not among them: what a replay is made with.
+    """The effects of a replay: the given ones and those of the torque sensors that are not among them.
 
-    Offsets always, all else where the space asks for it.  Friction comes first: it is part of the torque that sensors
-    delay, scale or mix.
+    Torque offsets are always added, friction and gain of sensors if the space has their parameters.  Friction comes
+    first, since sensors delay, scale or mix a torque that contains it.
     """
     given = {e.name for e in effects}
     friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
-    felt, read = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
-    return (*(e for e in felt if e.name not in given), *effects, *(e for e in read if e.name not in given))
+    before, after = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
+    return (*(e for e in before if e.name not in given), *effects, *(e for e in after if e.name not in given))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
 def _sensor_effects(
     joints: tuple[str, ...], prescribed: bool, friction: bool, gain: bool
 ) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
-    """What a sensor feels and what it makes of it; the same effects each time: programs are distinguished by theirs."""
-    felt = (joint_friction_effect(joints, jnp.sign if prescribed else direction),) if friction else ()
-    read = (torque_gain_effect(joints),) if gain else ()
-    return felt, (*read, torque_offset_effect(joints))
+    """Effects before and after the others.  Cached, since programs are looked up by the identity of their effects."""
+    before = (joint_friction_effect(joints, jnp.sign if prescribed else direction),) if friction else ()
+    after = (torque_gain_effect(joints),) if gain else ()
+    return before, (*after, torque_offset_effect(joints))
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
@@ -240,7 +249,7 @@ def _servo_program(
     clocked: Clocked,
     mj_step: bool,
 ) -> Callable[..., Rollout]:
-    """(values [B, D], *`traced_part` of a drive, steps) -> motion [B, T, ...]; scene and effects count by identity."""
+    """(values [B, D], *`traced_part` of a drive, steps) -> motion [B, T, ...], cached by identity of the scene."""
     motion = servo_motion(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
     return over_block(lambda values, *of_drive: motion(make_physics(scene, space, values), *of_drive))
@@ -250,13 +259,13 @@ def _servo_program(
 def _sensors(
     scene: Scene, layout: Layout, effects: tuple[Effect, ...], timestep: float, steps: int
 ) -> Callable[..., Rollout]:
-    """(values [B, D], motion [B, T, ...]) -> Rollout [B, ...] of the motion's first steps."""
+    """The sensor model: (values [B, D], motion [B, T, ...]) -> Rollout [B, ...] of the motion's first steps."""
     space = layout.space
 
     def sense(values: jax.Array, motion: Rollout) -> Rollout:
-        return sensed(motion, theta_of(space, values), effects, timestep, steps)
+        return with_sensor_model(motion, theta_of(space, values), effects, timestep, steps)
 
-    return over_block(_of_bodies(scene, space, sense), alike=False)
+    return over_block(_of_bodies(scene, space, sense), shared=False)
 
 
 @functools.lru_cache(maxsize=PROGRAMS)
@@ -288,23 +297,23 @@ def _inverse_in_c(
     torque: TorqueConvention,
     joints: tuple[str, ...],
 ) -> tuple[Callable[..., Rollout], Callable[[jax.Array, Path], jax.Array]]:
-    """The same in plain C, but for what the sensors make of it."""
+    """`_inverse_program` with inverse dynamics in plain C; the sensor model is compiled."""
     space = layout.space
-    if why := why_no_path_in_c(scene, space, torque, effects):
+    if why := why_no_path_in_c(space, torque, effects):
         raise ValueError(f"the C engine cannot replay this: {why}; use MJX")
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
     bodies, sense = c_path_torques(scene, space, torque, joints), path_sensors(scene, torque, effects, joints)
 
-    def read(values: jax.Array, felt: PathTorques, path: Path) -> Rollout:
-        return sense(complete(theta_of(space, values), effects), path, felt)
+    def read(values: jax.Array, torques: PathTorques, path: Path) -> Rollout:
+        return sense(complete(theta_of(space, values), effects), path, torques)
 
     each = jax.jit(
         jax.vmap(_of_bodies(scene, space, read), in_axes=(0, 0, None)), compiler_options=runtime.compiler_options()
     )
 
     def batch(values: np.ndarray, path: Path) -> Rollout:
-        felt = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
-        return each(jnp.asarray(values, jnp.float32), felt, path)
+        in_c = PathTorques(*(jnp.asarray(part, jnp.float32) for part in bodies(values, path)))
+        return each(jnp.asarray(values, jnp.float32), in_c, path)
 
     def torques(values: jax.Array, paths: Path) -> jax.Array:
         row = np.asarray(values)[None]
@@ -314,8 +323,8 @@ def _inverse_in_c(
 
 
 def _of_bodies(scene: Scene, space: Space, replay: Callable[..., Rollout]) -> Callable[..., Rollout]:
-    """The replay of a row of values [D], which gives no numbers where no body can have the row's inertia."""
-    if not free_inertias(scene, space):
+    """The replay of a row of values [D], not finite if the row has an inertia that no body can have."""
+    if not free_inertias(space):
         return replay
 
     def checked(values: Any, *more: Any) -> Rollout:

@@ -1,10 +1,11 @@
-"""Which engine replays a fit: plain C where it can and a batch is not too large for it, else MJX.
+"""Choose the engine of a fit: plain C if it supports the replay and batches are small, else MJX.
 
-On a CPU plain C steps an arm without contacts at least as fast as a compiled batch of MJX, and compiles nothing.  The
-first 30 s of a log of an SO-101 (six joints, 64 samples, one core): MJX 40 s of compilation and 6.1 s, C 4.2 s.  Its
-steps are of first order, though (docs/simulation-step.md): repeats, whose mean is precise, resolve their error.
+On a CPU plain C steps an arm without contacts at least as fast as a compiled batch of MJX, and needs no compilation.
+The first 30 s of a log of an SO-101 (six joints, 64 samples, one core) take 4.2 s in C; MJX compiles for 40 s and runs
+for 6.1 s.  But C's steps are of first order (docs/simulation-step.md).  The mean of repeats is precise enough to
+resolve their error.
 
-A GPU overtakes the C engine on the processor beside it at some 16 samples per core, and compiles for a minute
+A GPU is faster than the C engine on its host from about 16 samples per core on, and compiles for a minute
 (`benchmarks/results/gpu.json`: 256 samples of the door on an H200 and on 16 cores).
 """
 
@@ -24,12 +25,12 @@ from droid_jax.simulate.c_reference import why_not_in_c
 
 ENGINES = ("mjx", "mujoco")
 CHOICES = ("auto", *ENGINES)
-PER_CORE = 16  # samples of a batch up to which C is the faster one beside a GPU
+PER_CORE = 16  # samples per core up to which C is faster than a GPU
 
 
 @dataclass(frozen=True)
 class EngineChoice:
-    """engine: "mjx" or "mujoco"; why: it was chosen, to be shown."""
+    """An engine ("mjx" or "mujoco") and why it was chosen, for messages."""
 
     engine: str
     why: str
@@ -38,18 +39,18 @@ class EngineChoice:
 def choose_engine(
     scene: Scene, space: Space, recordings: Sequence[Recording], effects: Sequence[Effect] = (), samples: int = 1
 ) -> EngineChoice:
-    """The engine for a fit of `space` to recordings, where the caller has no wish.
+    """The engine for a fit of `space` to recordings, if the user names none.
 
     Args:
         scene: what is simulated.
         space: the parameters and nuisances that are fitted.
         recordings: to be replayed.
         effects: in the model.
-        samples: parameter vectors that are replayed at a time.
+        samples: parameter vectors of a batch.
 
     Returns:
-        Plain C ("mujoco") in one process, for commanded motions of one repeat in a scene without contact pairs, where C
-        has all that the replay needs, and on a machine with a GPU for batches of few samples; else MJX.
+        Plain C ("mujoco") in one process, for commanded motions of one repeat in a scene without contact pairs, if C
+        supports the replay.  On a machine with a GPU also the batch must be small (PER_CORE).  Else MJX.
     """
     accelerated = (backend := jax.default_backend()) != "cpu"
     if accelerated and samples > PER_CORE * runtime.cores():
@@ -59,11 +60,11 @@ def choose_engine(
     if any(not recording.command.size for recording in recordings):
         return EngineChoice("mjx", "a log without commands is replayed by inverse dynamics")
     if any(recording.repeats > 1 for recording in recordings):
-        return EngineChoice("mjx", "repeats resolve the error of C's steps of first order")
+        return EngineChoice("mjx", "repeats resolve the error of C's first-order steps")
     if scene.grip is not None or scene.model.npair:
         return EngineChoice("mjx", "contact pairs need its second-order step")
     reasons = [why_not_in_c(scene, space, r.torque, effects) for r in recordings]
     if reason := next(filter(None, reasons), None):
         return EngineChoice("mjx", reason)
-    place = f"for {samples} samples a batch" if accelerated else "on a CPU"
-    return EngineChoice("mujoco", f"{place} it is as fast and compiles nothing")
+    case = f"for {samples} samples a batch" if accelerated else "on a CPU"
+    return EngineChoice("mujoco", f"{case} it is as fast and compiles nothing")

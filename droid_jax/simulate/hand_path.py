@@ -1,4 +1,4 @@
-"""Paths of a hand: minimum-jerk timing, and inverse kinematics by damped least squares."""
+"""Paths of a hand: minimum-jerk time profiles, and inverse kinematics by damped least squares."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from droid_jax.model.scene import Scene
 
 
 def minimum_jerk(fraction: np.ndarray) -> np.ndarray:
-    """Smooth step 0 -> 1 with zero velocity and acceleration at both ends (Flash and Hogan 1985)."""
+    """Minimum-jerk step from 0 to 1 over fractions 0 to 1 of the duration (Flash and Hogan 1985)."""
     s = np.clip(fraction, 0.0, 1.0)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
@@ -22,9 +22,20 @@ def solve_pose(
     *,
     body: str | None = None,
 ) -> np.ndarray:
-    """Damped least squares from q [J] to a pose of a body's frame, or of the pinch point where none is named.
+    """Inverse kinematics by damped least squares.
 
-    Raises ValueError where it does not get there.
+    Args:
+        scene: with the arm.
+        q: [J] rad or m, initial joint positions.
+        position: [3] m, target position of the frame.
+        rotation: [3, 3] target rotation of the frame.
+        body: whose frame is moved; None: the site `pinch`.
+
+    Returns:
+        [J] joint positions.
+
+    Raises:
+        ValueError: the iteration does not converge.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     frame = data.site("pinch") if body is None else data.body(body)

@@ -1,7 +1,4 @@
-"""Replay a measured motion by inverse dynamics: no servo, no scan, vectorised over time.
-
-For recordings that hold no commands, such as logs of free motion.
-"""
+"""Inverse dynamics along a measured motion, vectorised over time, for recordings without commands."""
 
 from __future__ import annotations
 
@@ -30,21 +27,30 @@ from droid_jax.simulate.measured_motion import CUTOFF, Motion, measured_througho
 from droid_jax.simulate.replay import apply_sensor_model
 
 
-def prescribed(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
-    """The joints whose measured motion a replay follows: the scene's, then all others that the log holds throughout.
+def prescribed_joints(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
+    """The joints whose measured motion a replay prescribes: the scene's, then all others measured throughout.
 
-    Torques are compared of the scene's joints alone, but what else moved carries them, or is carried.  All other joints
-    stand still, where the recording states it (qpos0) or else as in the scene; one that carries a measured joint and is
-    not stated is warned of, and so is one that was measured for a part of the time.
-    cutoff: Hz, of the filter of the positions, on which it depends which gaps are bridged.
-    Raises ValueError where a joint of several degrees carries a measured one: a log does not tell how it moves.
+    Only torques of the scene's joints are compared, but other joints that move act on them.  Joints that are not
+    measured throughout stand still in their stated position (qpos0), else as in the scene.  A warning names those of
+    them that carry a measured joint and are not stated, and those that were measured for a part of the time.
+
+    Args:
+        scene: the simulated one.
+        recording: without commands.
+        cutoff: Hz, of the positions' low-pass; it decides which gaps are bridged.
+
+    Returns:
+        Names of joints.
+
+    Raises:
+        ValueError: a free or ball joint carries a measured joint, or no positions were measured.
     """
     floating = scene.floating(scene.joints)
     if floating:
         raise ValueError(
-            f"recording {recording.name!r} holds no commands, and {', '.join(floating)} of scene {scene.name!r}, of "
-            "several degrees, carries measured joints: how it moves is not in the log, nor what holds it; take it out "
-            "of the MJCF where the robot is bolted down"
+            f"recording {recording.name!r} holds no commands, and {', '.join(floating)} of scene {scene.name!r} (a "
+            "free or ball joint) carries measured joints: the log does not contain its motion; remove it from the MJCF "
+            "if the robot is bolted down"
         )
     if "position" not in recording.channels:
         raise ValueError(
@@ -52,41 +58,46 @@ def prescribed(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tu
             "read the log with its commands (--command-topic of `convert`) or with positions"
         )
     channel = recording.channel("position")
-    whole = measured_throughout(channel, cutoff)
-    others = [j for j in scene.single_joints if j in whole and j not in scene.joints]
+    throughout = measured_throughout(channel, cutoff)
+    others = [j for j in scene.single_joints if j in throughout and j not in scene.joints]
     joints = (*scene.joints, *others)
     if coupled := coupled_to_others(scene, joints):
         warnings.warn(
-            f"recording {recording.name!r} holds no commands, and a prescribed motion leaves {', '.join(coupled)} of "
-            f"scene {scene.name!r} out, with what it moves: measure the positions of all its joints, or record the "
+            f"recording {recording.name!r} holds no commands, so the replay ignores {', '.join(coupled)} of scene "
+            f"{scene.name!r} and the joints that it moves: measure the positions of all its joints, or record the "
             "commands",
             stacklevel=3,
         )
-    stated = {j for j in recording.qpos0 if j not in channel.columns}  # of a measured one it is where it began
+    stated = {j for j in recording.qpos0 if j not in channel.columns}  # a measured joint's qpos0 is its start only
     still = [j for j in scene.carriers(scene.joints) if j not in joints and j not in stated]
     if still:
         warnings.warn(
             f"recording {recording.name!r} does not hold the positions of {', '.join(still)} throughout, which carry "
-            "measured joints: they are taken to stand still as in the scene (state where in qpos0)",
+            "measured joints: the replay holds them still as in the scene (state where in qpos0)",
             stacklevel=3,
         )
-    seen = dict(zip(channel.columns, np.any(channel.mask, axis=(0, 1)).tolist(), strict=True))
-    partly = [j for j in scene.single_joints if seen.get(j) and j not in (*joints, *still)]
+    measured = dict(zip(channel.columns, np.any(channel.mask, axis=(0, 1)).tolist(), strict=True))
+    partly = [j for j in scene.single_joints if measured.get(j) and j not in (*joints, *still)]
     if partly:
         warnings.warn(
-            f"recording {recording.name!r} holds the positions of {', '.join(partly)} for a part of the time: they are "
-            "taken to stand still where they were first; cut the log (`convert --start S --end S`) to follow them",
+            f"recording {recording.name!r} holds the positions of {', '.join(partly)} for a part of the time: the "
+            "replay holds them still at their first position; cut the log (`convert --start S --end S`) to follow them",
             stacklevel=3,
         )
     return joints
 
 
 class Path(NamedTuple):
-    """The arrays of a motion, single precision: [T] s, [T, J] rad, rad/s, rad/s^2 (m for slides).
+    """The arrays of a `Motion` in single precision, an input of compiled replays.
 
-    at_rest: [T, J] bool, samples at which friction is not known from the speed.  measured: [T, J] N m (N), the torque
-    measured there, NaN where none was.  torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2), by which
-    noise may take it out of the interval of friction.  still: [nq] where all joints that do not move stand.
+    Attributes:
+        time: [T] s.
+        position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for slides).
+        at_rest: [T, J] bool, samples at rest, whose friction the speed does not determine.
+        measured: [T, J] N m (N), measured torque, NaN if there is none.
+        torque_slack: [J] N m (N), by which noise of the torque may leave the interval of friction.
+        acceleration_slack: [J] rad/s^2 (m/s^2), likewise noise of the acceleration.
+        still: [nq] pose, of which joints that are not prescribed keep their positions.
     """
 
     time: jax.Array
@@ -101,14 +112,14 @@ class Path(NamedTuple):
 
 
 def motion_path(scene: Scene, motion: Motion) -> Path:
-    """What a compiled replay is given of a motion; ValueError where it states a joint that the scene has not."""
+    """The arrays of a motion as input of a compiled replay; ValueError if it states a joint that the scene lacks."""
     rest = motion.velocity == 0.0 if motion.rest is None else motion.rest
     measured = np.full(motion.velocity.shape, np.nan) if motion.measured is None else motion.measured
-    given = [
+    given_slacks = [
         np.zeros(motion.velocity.shape[1]) if slack is None else slack
         for slack in (motion.torque_slack, motion.acceleration_slack)
     ]
-    arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, measured, *given)
+    arrays = (motion.time, motion.position, motion.velocity, motion.acceleration, measured, *given_slacks)
     time, position, velocity, acceleration, measured, *slacks = (jnp.asarray(a, jnp.float32) for a in arrays)
     still = jnp.asarray(scene.initial_qpos(motion.others), jnp.float32)
     at_rest = jnp.asarray(rest)
@@ -120,24 +131,35 @@ def path_replay(
 ) -> Callable[[Physics, Path], Rollout]:
     """Torques of the scene's joints along prescribed motions, vectorised over time.
 
-    joints: those of the paths, the scene's first (default: these alone).
-
     tau = M(q) qdd + c(q, qd) - passive forces [+ g(q)] and, on the motor side, + armature qdd + dry friction.
-    Dry friction, the model's own and that of effects, is loss * sgn(qd).  At rest it is set-valued: of all values
-    between -loss and loss, and a slack for noise, the one that comes nearest to the measured torque, so that a residual
-    is the distance to that interval.
-    Passive are springs and dampers of joints and tendons; joints' damping on the motor side only: on the link side none
-    of the motor's own terms appear, and what the joint adds there (Coulomb and viscous friction, offset) is an
-    observation effect.  Constraints (contacts, limits, equalities) take no part.
-    Whether g(q) is there is the recording's word alone, not the MJCF's gravcomp.
-    The path is what encoders read.
-    Forces and friction of effects are what the torque has to overcome, on either side.
-    Raises ValueError for effects of command and servo, which a prescribed motion has not, and for air or water.
+
+    - Passive forces are springs and dampers of joints and tendons; the joints' damping counts on the motor side only.
+      On the link side no term of the motor appears.  Friction and offset of a link-side sensor are observation effects.
+    - g(q) appears if the recording's torque convention contains gravity, whatever the MJCF's gravcomp is.
+    - Dry friction of the model and of effects is loss * sgn(qd).  At rest it is set-valued: between -loss and loss,
+      with a slack for noise, it takes the value nearest to the measured torque.  So a residual at rest is the distance
+      to that interval.
+    - The torque overcomes forces and friction of effects on either side.
+    - Constraints (contacts, limits, equalities) are left out.
+    - Positions of the path are those that encoders read.
+
+    Args:
+        scene: the simulated one.
+        convention: of the torques.
+        effects: in the replay.
+        joints: those of the paths, the scene's first; empty: the scene's.
+
+    Returns:
+        (physics, path) -> Rollout [T, ...] of one sample.
+
+    Raises:
+        ValueError: an effect acts on commands or servos, which a prescribed motion does not have, or the scene has a
+            fluid.
     """
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
     steering = [e.name for e in effects if e.profile or e.command or e.servo]
     if steering:
-        raise ValueError(f"a prescribed motion has no commands that an effect could change: {', '.join(steering)}")
+        raise ValueError(f"effects {', '.join(steering)} change commands, which a prescribed motion does not have")
     joints = joints or scene.joints
     dofs, positions = np.array([scene.dof(j) for j in joints]), np.array([scene.qpos(j) for j in joints])
     compensated = 1.0 - scene.model.jnt_actgravcomp[scene.model.dof_jntid]
@@ -162,36 +184,39 @@ def path_replay(
             torque = inertia @ full.at[dofs].set(acceleration) + data.qfrc_bias
             springs = data.qfrc_passive - compensated * data.qfrc_gravcomp
             torque = torque - springs
-            carried = jnp.zeros_like(velocity)  # weight that gears carry and the torque does not hold
+            carried = jnp.zeros_like(velocity)  # weight that the gears carry but the torque convention excludes
             if not convention.gravity and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
                 carried = -field_force(model, data, model.body_mass, model.opt.gravity)
             if error is not None and not convention.gravity:
                 torque = torque + misplaced_weight(model, data, error)
             direction = jnp.sign(velocity)
-            felt = torque + model.dof_frictionloss * direction if motor else torque
+            with_friction = torque + model.dof_frictionloss * direction if motor else torque
             links = springs + link_model.dof_damping * velocity - data.qfrc_bias
-            motors = felt + (model.dof_damping - link_model.dof_damping) * velocity  # before the joints' damping
+            motors = with_friction + (model.dof_damping - link_model.dof_damping) * velocity  # before joint damping
             gear = jnp.stack([motors + carried, links - carried])
-            state = State(time, data.qpos, velocity, felt, model, data, gear)
-            behind = _behind_the_sensor(scene, theta)
-            own = model.dof_frictionloss if motor else behind
-            force, loss = _resistance(theta, state, own, effects)
-            # What is behind the sensor `joint_friction_effect` adds, as an observation.
-            friction = (loss if motor else loss - behind) * direction
-            loss = loss + behind if motor else loss
+            state = State(time, data.qpos, velocity, with_friction, model, data, gear)
+            sensor_loss = _sensor_friction(scene, theta)
+            base_loss = model.dof_frictionloss if motor else sensor_loss
+            force, loss = _resistance(theta, state, base_loss, effects)
+            # `joint_friction_effect` adds the sensor's friction, as an observation.
+            friction = (loss if motor else loss - sensor_loss) * direction
+            loss = loss + sensor_loss if motor else loss
             rows = (torque + force + friction, loss, jnp.diagonal(inertia))
             return PathTorques(*(row[scene.joint_dofs] for row in rows))
 
-        felt = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
-        return sense(theta, path, felt)
+        torques = jax.vmap(at)(path.time, path.position, path.velocity, path.acceleration)
+        return sense(theta, path, torques)
 
     return replay
 
 
 class PathTorques(NamedTuple):
-    """What a path takes of the scene's joints, before their sensors, [T, J] each.
+    """Inverse dynamics of the scene's joints before the sensor model, [T, J] each.
 
-    torque: N m (N).  loss: all dry friction, N m (N), that behind a sensor too.  inertia: kg m^2 (kg), about the joint.
+    Attributes:
+        torque: N m (N).
+        loss: N m (N), all dry friction, including that of `joint_friction_effect`.
+        inertia: kg m^2 (kg), about the joint.
     """
 
     torque: Any
@@ -202,7 +227,7 @@ class PathTorques(NamedTuple):
 def path_sensors(
     scene: Scene, convention: TorqueConvention, effects: Sequence[Effect] = (), joints: Sequence[str] = ()
 ) -> Callable[[Theta, Path, PathTorques], Rollout]:
-    """What sensors read of the torques along a path, which at rest are those nearest to the measured ones.
+    """The sensor model of torques along a path, with set-valued friction at rest.
 
     The arguments are those of `path_replay`.
     """
@@ -210,51 +235,57 @@ def path_sensors(
     motor = convention.side is TorqueSide.MOTOR
     hinge = joints.index(scene.object_joint) if scene.object_joint in joints else None
 
-    def sense(theta: Theta, path: Path, felt: PathTorques) -> Rollout:
+    def sense(theta: Theta, path: Path, torques: PathTorques) -> Rollout:
         rollout = Rollout(
             time=path.time,
-            torque=felt.torque,
+            torque=torques.torque,
             position=path.position[:, :count],
             velocity=path.velocity[:, :count],
             object_angle=jnp.zeros(len(path.time)) if hinge is None else path.position[:, hinge],
             contact=jnp.zeros((len(path.time), 0), bool),
             finite=jnp.array(True),
         )
-        seen = apply_sensor_model(rollout, theta, effects)
-        # The slack is there without friction too: else any friction would pay by taking the noise at rest.
-        slack = jnp.hypot(path.torque_slack[:count], felt.inertia * path.acceleration_slack[:count])
-        bound = jnp.maximum(felt.loss, 0.0) + slack
-        friction = felt.loss * jnp.sign(path.velocity[:, :count])
-        held = held_torque(seen.torque - friction, bound, path.measured[:, :count])
-        rest = path.at_rest[:, :count] & _may_rub(scene, theta, effects, motor)
-        return replace(seen, torque=jnp.where(rest, held, seen.torque))
+        sensed = apply_sensor_model(rollout, theta, effects)
+        # A model without friction has the slack too.  Otherwise any friction would gain by absorbing noise at rest.
+        slack = jnp.hypot(path.torque_slack[:count], torques.inertia * path.acceleration_slack[:count])
+        bound = jnp.maximum(torques.loss, 0.0) + slack
+        friction = torques.loss * jnp.sign(path.velocity[:, :count])
+        held = held_torque(sensed.torque - friction, bound, path.measured[:, :count])
+        rest = path.at_rest[:, :count] & _may_have_friction(scene, theta, effects, motor)
+        return replace(sensed, torque=jnp.where(rest, held, sensed.torque))
 
     return sense
 
 
-def _may_rub(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool) -> np.ndarray:
-    """[J] bool, joints that dry friction of this replay could hold; at rest the others are compared as ever.
+def _may_have_friction(scene: Scene, theta: Theta, effects: Sequence[Effect], motor: bool) -> np.ndarray:
+    """[J] bool, joints that can have dry friction in this replay; only these are set-valued at rest.
 
-    Which could is known before any value is: every model of a search has the same, so that none of them takes noise.
+    The names of parameters and effects decide, not their values.  So all models of a search treat the same samples
+    alike, and none gains by absorbing noise.
     """
     if any(effect.frictionloss is not None for effect in effects):
         return np.ones(len(scene.joints), bool)
-    behind = np.array([Role.COULOMB.in_theta(joint) in theta for joint in scene.joints])
-    return behind | (motor & (scene.model.dof_frictionloss[scene.joint_dofs] > 0.0))
+    of_sensor = np.array([Role.COULOMB.in_theta(joint) in theta for joint in scene.joints])
+    return of_sensor | (motor & (scene.model.dof_frictionloss[scene.joint_dofs] > 0.0))
 
 
 def held_torque(free: jax.Array, bound: jax.Array, measured: jax.Array) -> jax.Array:
-    """Torque at rest: `free`, without dry friction, and the friction within +-bound that comes nearest to `measured`.
+    """Torque at rest: `free` plus the dry friction within +-bound that brings it nearest to `measured`.
 
-    All N m (N for slides) and of one shape; where nothing was measured (NaN), no friction.
+    Args:
+        free: N m (N for slides), torque without dry friction.
+        bound: N m (N), largest friction, of the same shape.
+        measured: N m (N), of the same shape; NaN: no friction is added.
     """
     friction = jnp.clip(measured - free, -bound, bound)
     return free + jnp.where(jnp.isnan(measured), 0.0, friction)
 
 
-def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Effect]) -> tuple[jax.Array, jax.Array]:
-    """[nv] N m that the effects' forces take to overcome, and [nv] all dry friction, `own` [nv] and that of effects."""
-    loss, resistance = own, jnp.zeros_like(state.qvel)
+def _resistance(
+    theta: Theta, state: State, base_loss: jax.Array, effects: Sequence[Effect]
+) -> tuple[jax.Array, jax.Array]:
+    """[nv] N m that overcomes the effects' forces, and [nv] dry friction: `base_loss` changed by the effects."""
+    loss, resistance = base_loss, jnp.zeros_like(state.qvel)
     for effect in effects:
         if effect.frictionloss is not None:
             loss = effect.frictionloss(theta, state, loss)
@@ -263,7 +294,7 @@ def _resistance(theta: Theta, state: State, own: jax.Array, effects: Sequence[Ef
     return resistance, loss
 
 
-def _behind_the_sensor(scene: Scene, theta: Theta) -> jax.Array:
+def _sensor_friction(scene: Scene, theta: Theta) -> jax.Array:
     """[nv] the dry friction that `joint_friction_effect` adds to a link-side torque."""
     coulomb = column(theta, Role.COULOMB.value, scene.joints)
     return jnp.zeros(scene.model.nv, jnp.float32).at[scene.joint_dofs].set(coulomb)

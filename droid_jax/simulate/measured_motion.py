@@ -1,4 +1,4 @@
-"""The motion behind a log without commands: position, velocity and acceleration from measured positions."""
+"""Position, velocity and acceleration from the measured positions of a log without commands."""
 
 from __future__ import annotations
 
@@ -11,28 +11,33 @@ import scipy
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
-BRIDGED = 0.25  # periods of the cutoff: over gaps no longer than that positions are interpolated,
-LOST = 2.5  # nor, in a slow log, over gaps of so many usual steps: one lost sample
-CUTOFF = 20.0  # Hz, of the position before it is differentiated; above that of the torques, which are compared
+BRIDGED = 0.25  # periods of the cutoff; positions are interpolated over gaps up to this,
+LOST = 2.5  # or up to so many median steps (one lost sample), whichever is longer
+CUTOFF = 20.0  # Hz, low-pass of the positions before differentiation; above that of the compared torques
 OVERSAMPLING = 6.0  # rows of a motion per period of its cutoff
-REGULAR = 0.01  # largest deviation of a clock's step from their mean, as a share, that a filter may overlook
-ALIKE = 0.05  # RMS distance of a repeat from their mean, as a share of the joint's travel, beyond which it is another
-STILL = 0.02  # rad or m, the least such distance
-PASSES = 20  # see `_common`
-EDGE = 0.3  # s left out at both ends, where a zero-phase filter has no neighbours
+REGULAR = 0.01  # largest deviation of a clock's step from the mean step, as a share of it, of a regular clock
+REPEAT_SHARE = 0.05  # of the joint's travel; a repeat whose RMS distance from the mean is larger is another motion
+REPEAT_DISTANCE = 0.02  # rad or m, least such distance
+PASSES = 20  # of the fixed-point iteration in `_common`
+EDGE = 0.3  # s, cut at both ends, where a zero-phase filter is inexact
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A measured motion of some joints, for logs without commands.
 
-    joints: J names.  time: [T] s, regular.  position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for
-    slides).  torque: convention of the measured torque.  others: joints that stand still -> where, as far as stated.
-    rest: [T, J] bool, samples at rest (`simulate.rest`); None: those of speed zero.
-    measured: [T, J] N m (N), measured torque at these times, NaN where there is none; None: nowhere.
-    torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
-    interval of its friction, because measured torque and acceleration are noisy; None: not at all.
-    known: parameter -> its value in this recording, or what stands for it, whatever a row says (`Recording.known`).
+    Attributes:
+        joints: J names.
+        time: [T] s, regular.
+        position, velocity, acceleration: [T, J] rad, rad/s, rad/s^2 (m for slides).
+        torque: convention of the measured torque.
+        others: joint that stands still -> its stated position, rad or m.
+        rest: [T, J] bool, samples at rest (`simulate.rest`); None: those of speed zero.
+        measured: [T, J] N m (N), measured torque at these times, NaN if there is none; None: none at all.
+        torque_slack: [J] N m (N), by which noise of the torque may leave the interval of friction at rest; None: 0.
+        acceleration_slack: [J] rad/s^2 (m/s^2), likewise noise of the acceleration; None: 0.
+        known: parameter -> its value in this recording, or the parameter that replaces it; it overrides the fitted
+            vector (`Recording.known`).
     """
 
     joints: tuple[str, ...]
@@ -64,15 +69,25 @@ def measured_motion(
 ) -> Motion:
     """The motion of `joints` in a recording: the mean of the repeats' positions, smoothed and differentiated.
 
-    A repeat that was not measured for a while keeps its distance from the others there (see `_common`); gaps of BRIDGED
-    periods of the cutoff, or of LOST steps, are bridged.
-    The position passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz; velocity and acceleration are those
-    of the quintic spline through it; measured velocities are not used.  EDGE s at both ends are left out.
-    A clock that jitters is made regular first, along a cubic spline.
-    alike: joints of which all repeats must be one motion; None: all.
-    rest: below which speed a sample counts as at rest.
-    Raises ValueError where a joint's position was not measured throughout, the log is too slow for
-    the cutoff (in one long step too), or too short.
+    1. Splines bridge short gaps.  In a longer gap a repeat keeps its distance from the others (see `_common`).
+    2. A jittering clock is resampled along a cubic spline.
+    3. The mean position passes a zero-phase Butterworth filter of order 4.
+    4. Velocity and acceleration are derivatives of a quintic spline.  Measured velocities are not used.
+    5. EDGE s are cut at both ends.
+
+    Args:
+        recording: with positions.
+        joints: whose motion is wanted.
+        cutoff: Hz, of the filter.
+        alike: joints whose repeats must all be the same motion; None: all.
+        rest: which samples count as at rest; None: the defaults.
+
+    Returns:
+        The motion at OVERSAMPLING * cutoff Hz.
+
+    Raises:
+        ValueError: a joint's position was not measured throughout, repeats are different motions, the log is too
+            slow for the cutoff (also in one long step), or it is too short.
     """
     channel = recording.channel("position")
     unknown = [j for j in joints if j not in channel.columns]
@@ -91,23 +106,22 @@ def measured_motion(
             "(`python -m droid_jax.run convert --start S --end S`)"
         )
     rate = (len(channel.time) - 1) / float(channel.time[-1] - channel.time[0])
-    usual = 1 / float(np.median(np.diff(channel.time)))  # a lost sample makes no slow log
-    if max(rate, usual * (1 + 1e-6)) < 2.5 * cutoff or rate <= 2 * cutoff:
+    median_rate = 1 / float(np.median(np.diff(channel.time)))  # not affected by a lost sample
+    if max(rate, median_rate * (1 + 1e-6)) < 2.5 * cutoff or rate <= 2 * cutoff:
         raise ValueError(
             f"recording {recording.name!r} holds positions at {rate:.4g} Hz, too slow to be smoothed at {cutoff:g} Hz; "
             f"give --motion-cutoff (CompareConfig.motion_cutoff) below {rate / 2.5:.3g} Hz"
         )
     position = _common(values, mask)
-    judged = [i for i, joint in enumerate(joints) if alike is None or joint in alike]
-    measured = np.ma.masked_array(values, ~mask)[:, :, judged]
-    _check_alike(recording.name, [joints[i] for i in judged], measured, position[:, judged])
+    checked = [i for i, joint in enumerate(joints) if alike is None or joint in alike]
+    measured = np.ma.masked_array(values, ~mask)[:, :, checked]
+    _check_alike(recording.name, [joints[i] for i in checked], measured, position[:, checked])
     position = _regular(recording.name, channel.time, position, cutoff)
     even = np.linspace(channel.time[0], channel.time[-1], len(channel.time))
     clock = _inner_clock(recording.name, channel.time, OVERSAMPLING * cutoff)
     q = scipy.signal.sosfiltfilt(scipy.signal.butter(4, cutoff, fs=rate, output="sos"), position, axis=0)
-    path = scipy.interpolate.make_interp_spline(
-        even, q, k=5
-    )  # differences lose 3 to 15 % of a fast motion in a slow log
+    # Finite differences would lose 3 to 15 % of a fast motion in a slow log.
+    path = scipy.interpolate.make_interp_spline(even, q, k=5)
     rows = (path(clock), path.derivative(1)(clock), path.derivative(2)(clock))
     config, timestep = rest or RestConfig(), (clock[-1] - clock[0]) / (len(clock) - 1)
     white = white_noise(position - q, rate, cutoff)
@@ -127,27 +141,27 @@ def measured_motion(
 
 
 def measured_throughout(channel: Channel, cutoff: float = CUTOFF) -> tuple[str, ...]:
-    """Columns of positions whose every sample some repeat holds, short gaps bridged as `measured_motion` does."""
+    """Columns of positions of which at least one repeat holds every sample, after short gaps are bridged."""
     _, mask = _bridged(channel.time, channel.values, channel.mask, cutoff)
     throughout: np.ndarray = np.asarray(mask.any(axis=0).all(axis=0))
-    return tuple(c for c, held in zip(channel.columns, throughout, strict=True) if held)
+    return tuple(column for column, complete in zip(channel.columns, throughout, strict=True) if complete)
 
 
 def _longest(time: np.ndarray, cutoff: float) -> float:
-    """s between two samples, at most, over which positions are interpolated."""
+    """s, the longest gap over which positions are interpolated."""
     return max(BRIDGED / cutoff, LOST * float(np.median(np.diff(time))))
 
 
 def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [N, T, J] and their mask, with cubic splines over short gaps."""
+    """Positions [N, T, J] and their mask after cubic splines bridge short gaps."""
     values, mask, longest = values.copy(), mask.copy(), _longest(time, cutoff)
     for n, j in np.argwhere(~mask.all(axis=1)):
-        seen = np.flatnonzero(mask[n, :, j])
-        for gap in np.flatnonzero(np.diff(seen) > 1):
-            first, last = int(seen[gap]), int(seen[gap + 1])
+        measured = np.flatnonzero(mask[n, :, j])
+        for gap in np.flatnonzero(np.diff(measured) > 1):
+            first, last = int(measured[gap]), int(measured[gap + 1])
             if time[last] - time[first] <= longest:
                 between = slice(first + 1, last)
-                near = seen[max(0, gap - 3) : gap + 5]
+                near = measured[max(0, gap - 3) : gap + 5]
                 path = scipy.interpolate.make_interp_spline(time[near], values[n, near, j], k=min(3, len(near) - 1))
                 values[n, between, j] = path(time[between])
                 mask[n, between, j] = True
@@ -155,44 +169,45 @@ def _bridged(time: np.ndarray, values: np.ndarray, mask: np.ndarray, cutoff: flo
 
 
 def _common(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """[T, J] mean of repeats [N, T, J], without a step where one of them was not measured for a while.
+    """[T, J] mean of repeats [N, T, J], without steps at the ends of a repeat's gaps.
 
-    A repeat keeps its distance from the others there, along a line between the gap's ends: m = (sum of what was
-    measured + sum of the distances of what was not) / number measured.  PASSES of it settle gaps that overlap.
+    In a gap a repeat keeps its distance from the mean, linearly interpolated between the gap's ends.  So the mean is
+    (sum of measured values + sum of interpolated distances) / number of measured values.  PASSES iterations converge
+    if gaps overlap.
     """
     common = np.mean(values, axis=0, where=mask)
     rows = np.arange(values.shape[1])
     for _ in range(0 if mask.all() else PASSES):
-        apart = values - common
+        distance = values - common
         for n, j in np.argwhere(~mask.all(axis=1)):
-            seen = mask[n, :, j]
-            if seen.any():
-                apart[n, ~seen, j] = np.interp(rows[~seen], rows[seen], apart[n, seen, j])
+            measured = mask[n, :, j]
+            if measured.any():
+                distance[n, ~measured, j] = np.interp(rows[~measured], rows[measured], distance[n, measured, j])
             else:
-                apart[n, :, j] = 0.0
-        common = np.where(mask, values, apart).sum(axis=0) / mask.sum(axis=0)
+                distance[n, :, j] = 0.0
+        common = np.where(mask, values, distance).sum(axis=0) / mask.sum(axis=0)
     return common
 
 
 def _check_alike(name: str, joints: Sequence[str], values: np.ma.MaskedArray, common: np.ndarray) -> None:
-    """ValueError where a repeat [N, T, J], masked where not measured, is another motion than the others."""
-    apart = np.sqrt(((values - common) ** 2).mean(axis=1).filled(0.0))  # [N, J]
+    """Raise ValueError if a repeat [N, T, J] (masked samples were not measured) is another motion than the others."""
+    distance = np.sqrt(((values - common) ** 2).mean(axis=1).filled(0.0))  # [N, J]
     travel = np.ptp(values, axis=1).max(axis=0).filled(0.0)  # [J]
-    excess = apart - np.maximum(ALIKE * travel, STILL)
+    excess = distance - np.maximum(REPEAT_SHARE * travel, REPEAT_DISTANCE)
     repeat, joint = (int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
     if excess[repeat, joint] > 0:
         raise ValueError(
-            f"recording {name!r} holds no commands, and repeat {repeat} is another motion than their mean: "
-            f"{joints[joint]} is {apart[repeat, joint]:.3g} from it (RMS), where it travels {travel[joint]:.3g}; cut "
-            "the logs alike, so that each begins where the motion does, or give them as recordings of their own"
+            f"recording {name!r} holds no commands, and repeat {repeat} is another motion than the mean of the "
+            f"repeats: {joints[joint]} is {distance[repeat, joint]:.3g} from it (RMS) and travels {travel[joint]:.3g}; "
+            "cut the logs so that each begins where the motion does, or give them as separate recordings"
         )
 
 
 def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -> np.ndarray:
-    """Positions [T, J] of a clock [T] s at as many even instants of its span; as they are where it is even already."""
+    """Positions [T, J] of a clock [T] s, resampled to T even instants; unchanged if the clock is regular."""
     steps = np.diff(time)
-    usual, longest = float(steps.mean()), int(np.argmax(steps))
-    if np.max(np.abs(steps - usual)) <= REGULAR * usual:
+    mean, longest = float(steps.mean()), int(np.argmax(steps))
+    if np.max(np.abs(steps - mean)) <= REGULAR * mean:
         return position
     if steps[longest] > max(1 / (2.5 * cutoff), _longest(time, cutoff)):
         raise ValueError(
@@ -204,11 +219,11 @@ def _regular(name: str, time: np.ndarray, position: np.ndarray, cutoff: float) -
 
 
 def _inner_clock(name: str, time: np.ndarray, rate: float) -> np.ndarray:
-    """[T] s at `rate`, EDGE inside the measured time."""
+    """[T] s at `rate` Hz, without EDGE s at both ends of the measured time."""
     first, last = float(time[0]) + EDGE, float(time[-1]) - EDGE
     if last - first < 1.0:
         raise ValueError(
             f"recording {name!r} is {time[-1] - time[0]:.3g} s long; a motion needs {1 + 2 * EDGE:g} s "
-            "(also what is held out of a lone log without commands, its last third)"
+            "(so does the last third of a single log without commands, which is held out)"
         )
     return first + np.arange(int(np.floor((last - first) * rate + 1e-6)) + 1) / rate

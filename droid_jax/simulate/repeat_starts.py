@@ -1,4 +1,4 @@
-"""Repeats that start apart: each is compared with a replay from where it starts itself."""
+"""Repeats with different starts: the effect of each repeat's start is simulated and subtracted."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from droid_jax.simulate.initial_state import DEFAULT_START, StartConfig
 from droid_jax.simulate.replay import Drive, make_drive
 
 
-def spread(recording: Recording, config: StartConfig = DEFAULT_START) -> dict[str, float]:
-    """Joint -> rad or m between the measured starts of the repeats that are furthest apart, where that is visible."""
+def start_ranges(recording: Recording, config: StartConfig = DEFAULT_START) -> dict[str, float]:
+    """Joint -> range of the repeats' measured starts, rad or m, of joints where it exceeds scatter and noise."""
     if "position" not in recording.channels or recording.repeats < 2 or not recording.command.size:
         return {}
     channel = recording.channels["position"]
     starts = _starts(recording)
-    found = {}
+    ranges = {}
     for c, joint in enumerate(channel.columns):
-        own = [start[joint] for start in starts if joint in start]
-        apart = float(np.ptp(own)) if own else 0.0
-        if apart > max(config.scatter, config.noise * _noise(channel, c, config.early)):
-            found[joint] = apart
-    return found
+        measured = [start[joint] for start in starts if joint in start]
+        width = float(np.ptp(measured)) if measured else 0.0
+        if width > max(config.scatter, config.noise * _noise(channel, c, config.early)):
+            ranges[joint] = width
+    return ranges
 
 
 def own_starts(recording: Recording, config: StartConfig = DEFAULT_START) -> Recording:
-    """The recording without stated starts (qpos0) of joints whose repeats were measured to start apart.
+    """The recording without the stated starts (qpos0) of joints whose measured starts differ between repeats.
 
-    One statement cannot be right for all of them.  The same object where there is nothing to leave out.
-    Raises ValueError for a recording that is not valid.
+    One stated start cannot be right for all of them.  Returns the same object if there are none.
+    Raises ValueError for an invalid recording.
     """
-    validate(recording, allow_jitter=True)  # one made in Python may not have been
-    apart = spread(recording, config)
-    if not apart.keys() & recording.qpos0.keys():
+    validate(recording, allow_jitter=True)  # a recording made in Python was perhaps not validated yet
+    different = start_ranges(recording, config)
+    if not different.keys() & recording.qpos0.keys():
         return recording
-    return replace(recording, qpos0={j: q for j, q in recording.qpos0.items() if j not in apart})
+    return replace(recording, qpos0={j: q for j, q in recording.qpos0.items() if j not in different})
 
 
 def from_one_start(
@@ -50,20 +50,23 @@ def from_one_start(
     replay: Callable[[Drive], Rollout],
     config: StartConfig = DEFAULT_START,
 ) -> Recording:
-    """The recording as if all repeats had started where `drive` does: less what their own starts change in a replay.
+    """The recording as if all repeats had started where `drive` does.
+
+    Each repeat is replayed from its own start.  The difference of that replay from the mean of these replays is
+    subtracted from the repeat.
 
     Args:
         scene: the simulated one.
-        recording: with commands; returned unchanged where its repeats start at one place.
-        drive: the mean start of these repeats.
+        recording: with commands.
+        drive: from the mean start of these repeats.
         replay: of one drive, at nominal values; traces [T, J].
-        config: what decides where repeats start.
+        config: thresholds.
 
     Returns:
-        The recording with values [N, Tc, C] less each repeat's difference from the repeats' mean.  Exact to first order
-        in the starts' spread.
+        The recording with corrected values [N, Tc, C], exact to first order in the spread of the starts.  The same
+        object if the repeats start at the same place, or if a replay diverges.
     """
-    if not spread(recording, config):
+    if not start_ranges(recording, config):
         return recording
     replays = [replay(_own_drive(scene, recording, n, drive, config)) for n in range(recording.repeats)]
     if not all(bool(np.all(np.asarray(r.finite))) for r in replays):
@@ -78,25 +81,25 @@ def from_one_start(
 
 
 def _own_drive(scene: Scene, recording: Recording, repeat: int, drive: Drive, config: StartConfig) -> Drive:
-    """The drive of one repeat from its own measured start; a joint that was not measured there starts as in `drive`."""
-    alone = recording.repeats_subset([repeat])
-    measured = alone.measured_start()
-    rest = {j: float(drive.qpos0[scene.qpos(j)]) for j in spread(recording, config) if j not in measured}
-    return make_drive(scene, replace(alone, qpos0={**alone.qpos0, **rest}), weigh=False, config=config)
+    """The drive of one repeat from its own measured start; joints that were not measured there start as in `drive`."""
+    one = recording.repeats_subset([repeat])
+    measured = one.measured_start()
+    unmeasured = {j: float(drive.qpos0[scene.qpos(j)]) for j in start_ranges(recording, config) if j not in measured}
+    return make_drive(scene, replace(one, qpos0={**one.qpos0, **unmeasured}), weigh=False, config=config)
 
 
-def _shifted(scene: Scene, channel: Channel, clock: np.ndarray, apart: np.ndarray) -> Channel:
-    """A channel less what repeats are apart [N, T, J] at times [T] s."""
+def _shifted(scene: Scene, channel: Channel, clock: np.ndarray, difference: np.ndarray) -> Channel:
+    """A channel minus each repeat's difference [N, T, J] at times [T] s."""
     values = channel.values.astype(float)
     for c, joint in enumerate(channel.columns):
         if joint in scene.joints:
-            trace = apart[:, :, scene.joints.index(joint)]
+            trace = difference[:, :, scene.joints.index(joint)]
             values[:, :, c] -= np.stack([np.interp(channel.time, clock, row) for row in trace])
     return replace(channel, values=values)
 
 
 def _starts(recording: Recording) -> list[dict[str, float]]:
-    """Of each repeat joint -> measured position at the start, rad or m."""
+    """For each repeat: joint -> measured initial position, rad or m."""
     position = {"position": recording.channels["position"]}
     return [
         replace(recording, channels=position).repeats_subset([n]).measured_start() for n in range(recording.repeats)
@@ -104,7 +107,7 @@ def _starts(recording: Recording) -> list[dict[str, float]]:
 
 
 def _noise(channel: Channel, column: int, seconds: float) -> float:
-    """Deviation of the white noise of a position, from its steps in the first seconds."""
+    """Standard deviation of a position's white noise, from its second differences in the first seconds."""
     early = channel.time <= channel.time[0] + seconds
     values = np.where(channel.mask, channel.values, np.nan)[:, early, column]
     second = np.abs(np.diff(values, n=2, axis=1))

@@ -1,8 +1,8 @@
-"""Replay one recording in simulation: the servo mode, a loop over time steps.
+"""Replay the commands of a recording in simulation: servos, contacts and sensors in a loop over time steps.
 
-`servo_replay` follows the recorded command through grasp and pull, as the paper does.  Recordings
-without commands are replayed by `simulate.inverse_dynamics`.  Both return a function Physics -> Rollout for
-ONE sample; `simulate.batching` makes a compiled, sharded batch of it.
+`servo_replay` follows the recorded command, as the paper does.  `simulate.inverse_dynamics` replays recordings without
+commands.  Both give a function Physics -> Rollout of one sample, of which `simulate.batching` makes a compiled,
+sharded batch.
 """
 
 from __future__ import annotations
@@ -36,27 +36,29 @@ from droid_jax.simulate.initial_state import (
     DEFAULT_START,
     StartConfig,
     check_weight,
-    holding,
+    holding_controls,
     start_pose,
     weight_share,
 )
 from droid_jax.simulate.servo_gains import check_gains, servo_factors, stated_gains, with_gains
 
 Replay = Callable[[Physics], Rollout]
-TORQUE_OFFSETS = "torque offset"  # the effect that adds them, which every replay in MJX has
+TORQUE_OFFSETS = "torque offset"  # name of the effect that adds them, in every replay in MJX
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
     """A recording's command on the simulation's clock.
 
-    command: [T, U] rad or m, in the scene's actuator order, at times k * timestep.
-    qpos0:   [nq] start pose.
-    timestep: s.
-    torque:  convention of the measured torque.
-    stiffness, damping: [U] servo gains stated by the recording, or None: the scene's own.
-    sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
-    known: parameter -> its value in this recording, or what stands for it, whatever a row says (`Recording.known`).
+    Attributes:
+        command: [T, U] rad or m, in the scene's actuator order, at times k * timestep.
+        qpos0: [nq] start pose, rad and m.
+        timestep: s.
+        torque: convention of the measured torque.
+        stiffness, damping: [U] servo gains stated by the recording, N m/rad and N m s/rad; None: the scene's.
+        sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
+        known: parameter -> its value in this recording, or the parameter that replaces it; it overrides the fitted
+            vector (`Recording.known`).
     """
 
     command: np.ndarray
@@ -75,17 +77,25 @@ class Drive:
 
 
 def end_on(recording: Recording, timestep: float) -> float:
-    """s after the recording's beginning, the last time step that its commands reach."""
+    """s from the recording's first command to the last time step that its commands cover."""
     return timestep * float(np.floor((recording.time[-1] - recording.time[0]) / timestep + 1e-6))
 
 
 def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config: StartConfig = DEFAULT_START) -> Drive:
-    """Resample a recording's command onto the simulation's clock and order its columns.
+    """Resample a recording's command onto the simulation's clock, in the order of the scene's actuators.
 
-    weigh: False where no torque is compared, so that it does not matter whether it contains the arm's weight.
-    config: what decides where the motion starts.
-    Raises ValueError where the recording has no commands, its joints or the weight in its torque do not fit the
-    scene, or nothing tells where a joint starts (see `start_pose`).
+    Args:
+        scene: to be driven.
+        recording: with commands.
+        weigh: whether to check the gravity convention of its torques (`check_weight`); False if no torque is compared.
+        config: thresholds of the start.
+
+    Returns:
+        The drive.
+
+    Raises:
+        ValueError: the recording has no commands, its joints or its gravity convention do not fit the scene, or the
+            start of a joint is unknown (see `start_pose`).
     """
     if recording.command.size == 0:
         raise ValueError(
@@ -99,7 +109,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
     steps = round(end_on(recording, timestep) / timestep) + 1
     clock = float(recording.time[0]) + np.arange(steps) * timestep
     qpos0 = start_pose(scene, recording, config)
-    held = holding(scene, qpos0)
+    held = holding_controls(scene, qpos0)
     refuse_floating(scene, recording, qpos0, held)
     command = np.tile(held, (steps, 1))
     sent = np.flatnonzero(columns >= 0)
@@ -121,44 +131,52 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
 
 
 def _check_driven(scene: Scene, recording: Recording) -> None:
-    """Raise ValueError where the scene has a joint that is commanded and no actuator for it."""
-    has = {scene.model.joint(i).name for i in range(scene.model.njnt)}
-    left = [j for j in recording.command_names if j in has and j not in scene.command_names]
-    if left or not scene.command_names:
-        lacks = f"actuator for {', '.join(left)}" if scene.command_names else "actuators"
+    """Raise ValueError if a commanded joint of the scene has no actuator."""
+    joints = {scene.model.joint(i).name for i in range(scene.model.njnt)}
+    undriven = [j for j in recording.command_names if j in joints and j not in scene.command_names]
+    if undriven or not scene.command_names:
+        missing = f"actuator for {', '.join(undriven)}" if scene.command_names else "actuators"
         coupled = int(np.sum(scene.model.eq_type == mujoco.mjtEq.mjEQ_JOINT))
         mimic = f"; its {coupled} <mimic> became <equality><joint>" if coupled else ""
-        urdf = f" (a URDF holds none: save it as MJCF and add them there{mimic})" if not scene.command_names else ""
+        urdf = f" (a URDF has none: save it as MJCF and add them there{mimic})" if not scene.command_names else ""
         raise ValueError(
-            f"scene {scene.name!r} has no {lacks}, and recording {recording.name!r} holds commands: give each "
+            f"scene {scene.name!r} has no {missing}, and recording {recording.name!r} holds commands: give each "
             f"commanded joint a <position> servo in the MJCF{urdf}"
         )
 
 
 def check_stateless(scene: Scene) -> None:
-    """Raise ValueError for actuators with an activation of their own, which the scan does not carry."""
+    """Raise ValueError for actuators with an activation state, which the time loop does not carry."""
     if scene.model.na:
-        own = np.flatnonzero(scene.model.actuator_actnum > 0)
+        stateful = np.flatnonzero(scene.model.actuator_actnum > 0)
         raise ValueError(
-            f"scene {scene.name!r} has actuators with a state of their own (activation), "
-            f"{', '.join(scene.command_names[u] for u in own)}; a replay needs plain position servos or motors: remove "
-            "dyntype or timeconst, and use <velocity> or <position> in place of <intvelocity>, <cylinder> and <muscle>"
+            f"scene {scene.name!r} has actuators with a state (activation), "
+            f"{', '.join(scene.command_names[u] for u in stateful)}; a replay needs position servos or motors without "
+            "one: remove dyntype or timeconst, and use <velocity> or <position> in place of <intvelocity>, <cylinder> "
+            "and <muscle>"
         )
 
 
 def servo_replay(
     scene: Scene, drive: Drive, effects: Sequence[Effect] = (), *, parity: bool = False, late: float = 0.5
 ) -> Replay:
-    """The motion that follows the command (`servo_motion`) and what the sensors make of it.
+    """A replay of one sample: the motion that follows the command (`servo_motion`), then the sensor model.
 
-    parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it; then
-      `late` steps late (see `_command`).
+    Args:
+        scene: what is simulated.
+        drive: the commands.
+        effects: in the replay.
+        parity: step exactly as the C engine does (see `droid_jax.model.step`), for comparisons with it.
+        late: steps by which commands are delayed if `parity` (see `_command`).
+
+    Returns:
+        physics -> Rollout [T, ...].
     """
     motion = servo_motion(scene, drive, effects, parity=parity, late=late)
-    own = traced_part(scene, drive)
+    inputs = traced_part(scene, drive)
 
     def replay(physics: Physics) -> Rollout:
-        return sensed(motion(physics, *own, len(drive.command)), physics.theta, effects, drive.timestep)
+        return with_sensor_model(motion(physics, *inputs, len(drive.command)), physics.theta, effects, drive.timestep)
 
     return replay
 
@@ -172,16 +190,24 @@ def servo_motion(
     late: float = 0.5,
     earlier: int = 0,
 ) -> Callable[..., Rollout]:
-    """The loop over time steps that follows a command: (physics, *`traced_part` of a drive, steps) -> T rows.
+    """The loop over time steps that follows a command, before the sensor model.
 
-    A replay that begins within a motion is given more: speed [nv], the time of its first row [s], which laws over time
-    see, and in front of its commands `earlier` rows of those that were sent until then, to which delays reach back.
+    A torque has the time of the state on which it acts.  The state is position, velocity, the solver's warm start and
+    the loads.  Everything else in mjx.Data is computed anew in each step, so that XLA removes what is not used.
 
-    Rows from `steps` on are zero, so that recordings of different lengths share one compiled program; their commands
-    are those of the last step, repeated.  Torques carry the time of the state they act on; sensors have not seen them.
-    A state is position, velocity, the solver's warm start and the loads: everything else in mjx.Data is rebuilt each
-    step, so that XLA drops what nobody reads.
-    Of the drive only its time step and its torque's convention are used.
+    Args:
+        scene: what is simulated.
+        drive: of which only the time step and the torque convention are used.
+        effects: in the replay.
+        parity: step exactly as the C engine does.
+        late: steps by which commands are delayed if `parity`.
+        earlier: commands in front of the first step, to which delays reach back in a replay that begins within a
+            motion.
+
+    Returns:
+        (physics, *`traced_part` of a drive, steps, speed, origin) -> Rollout [T, ...].  speed: [nv] initial velocity;
+        None: 0.  origin: s, time of the first row, for laws that depend on time; None: 0.  Rows from `steps` on are
+        zero, so that recordings of different lengths share one program; their commands repeat the last one.
     """
     check_options(scene.model, parity, f"a replay of scene {scene.name!r}")
     check_gains(scene, drive)
@@ -191,14 +217,14 @@ def servo_motion(
     joints, positions = scene.joint_dofs, scene.joint_qpos
     hinge = scene.qpos(scene.object_joint) if scene.object_joint else None
     hinge_speed = scene.dof(scene.object_joint) if scene.object_joint else None
-    shift = late if parity else 0.0  # steps, of the command; of positions in the other direction
-    half = late if parity else 0.5  # steps from the velocity before a step to the one that is told
+    shift = late if parity else 0.0  # steps by which commands are delayed and positions extrapolated
+    half = late if parity else 0.5  # steps from the velocity before a step to the reported one
     damping = has_servo_damping(scene.model)
     changing = changes_friction(effects)
 
     def step(sample: Any, k: jax.Array, carry: Any) -> Any:
         model, theta, error, table, origin = sample
-        (qpos, qvel, warm, load, gear), kept = carry
+        (qpos, qvel, warm, load, gear), traces = carry
         time = k * drive.timestep
         state = State(time if origin is None else origin + time, qpos, qvel, load, model, gear=gear)
         row = k + earlier if earlier else k
@@ -215,7 +241,7 @@ def servo_motion(
         servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
         torque = _joint_torque(model, before, after, servo, joints, drive, parity)
         astray = misplaced_compensation(model, after, error)
-        if astray is not None and drive.torque.gravity:  # a torque with the weight holds what compensates it
+        if astray is not None and drive.torque.gravity:  # such a torque contains the gravity compensation
             torque = torque + astray[joints]
         now = (
             torque,
@@ -224,9 +250,9 @@ def servo_motion(
             qpos[hinge] + shift * drive.timestep * qvel[hinge_speed] if hinge is not None else jnp.zeros(()),
             _touching(after, fingers),
         )
-        kept = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(kept, now, strict=True))
+        traces = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(traces, now, strict=True))
         gear = gear_torques(model, after, qvel) if changing else gear
-        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), kept
+        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), traces
 
     def motion(
         physics: Physics,
@@ -242,18 +268,18 @@ def servo_motion(
         sample = model, theta, encoder_error(scene, model), sent, origin
         zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, rows, len(joints)), jnp.float32)
         angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)
-        begun = (
+        first = (
             (start, zero if speed is None else speed, zero, zero, jnp.stack([zero, zero])),
             (*traces, angle, contact),
         )
-        _, (torque, position, velocity, angle, contact) = time_loop(step, sample, begun, steps)
+        _, (torque, position, velocity, angle, contact) = time_loop(step, sample, first, steps)
         time = jnp.zeros(rows, jnp.float32)
         return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
 
     return motion
 
 
-def sensed(
+def with_sensor_model(
     motion: Rollout,
     theta: Theta,
     effects: Sequence[Effect],
@@ -261,9 +287,9 @@ def sensed(
     steps: int | None = None,
     origin: jax.Array | None = None,
 ) -> Rollout:
-    """A motion's first rows (all of them where `steps` is None), as the sensors have them, and whether it is finite.
+    """The sensor model of a motion's first `steps` rows (None: all), and whether they are finite.
 
-    origin: time of its first row, s; None: 0.
+    origin: s, time of the first row; None: 0.
     """
     rows = len(motion.time) if steps is None else steps
     cut = jax.tree.map(lambda a: a[:rows] if a.ndim else a, motion)
@@ -273,7 +299,7 @@ def sensed(
 
 
 def traced_part(scene: Scene, drive: Drive) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What a replay takes of a drive beside its physics: command [T, U], start [nq], factors on gains [U, 2]."""
+    """The arrays of a drive that are inputs of a program: command [T, U], start [nq], factors on gains [U, 2]."""
     parts = (drive.command, drive.qpos0, servo_factors(scene, drive))
     command, start, gains = (jnp.asarray(part, jnp.float32) for part in parts)
     return command, start, gains
@@ -282,48 +308,47 @@ def traced_part(scene: Scene, drive: Drive) -> tuple[jax.Array, jax.Array, jax.A
 def _command(
     table: jax.Array, timestep: float, k: jax.Array, late: float, theta: Theta, effects: Sequence[Effect]
 ) -> jax.Array:
-    """[U] the command of step k, `late` steps late, and by `time_offset` of theta [s] on top.
+    """[U] the command of step k, delayed by `late` steps and by `time_offset` of theta [s].
 
-    C MuJoCo's implicitfast damps with a velocity half a step ahead of the position it computes
-    torques from; half a step of delay takes most of that first-order error out.  The replay's own
-    second-order step needs none.
+    C MuJoCo's implicitfast damps with a velocity half a step ahead of the position from which it computes torques.  A
+    delay of half a step removes most of that first-order error.  The second-order step of this replay needs none.
     """
     last = table.shape[0] - 1
 
-    def look(time: jax.Array) -> jax.Array:
+    def at_time(time: jax.Array) -> jax.Array:
         at = jnp.clip(time / timestep, 0.0, float(last))
         low = jnp.minimum(at.astype(jnp.int32), last - 1)
         part = at - low
         return table[low] * (1 - part) + table[low + 1] * part
 
-    # In steps first: seconds that are added up in float32 lose a fifth of a step in ten seconds.
+    # The delay is in steps: times in seconds, added up in float32, lose a fifth of a step in ten seconds.
     delay = late + jnp.asarray(theta.get(Role.TIME_OFFSET.value, 0.0), jnp.float32) / timestep
-    whole = jnp.floor(delay)
-    low = jnp.clip(k - whole.astype(jnp.int32) - 1, 0, last)
-    high = jnp.clip(k - whole.astype(jnp.int32), 0, last)
-    part = delay - whole
+    steps = jnp.floor(delay)
+    low = jnp.clip(k - steps.astype(jnp.int32) - 1, 0, last)
+    high = jnp.clip(k - steps.astype(jnp.int32), 0, last)
+    part = delay - steps
     ctrl = table[high] * (1 - part) + table[low] * part
     laws = [effect.command for effect in effects if effect.command is not None]
-    for law in laws:  # each law sees what the one before it made of the command
-        look = compose(law, theta, look)
-    return look((k - delay) * timestep) if laws else ctrl
+    for law in laws:  # each law gets the command as changed by the law before it
+        at_time = compose(law, theta, at_time)
+    return at_time((k - delay) * timestep) if laws else ctrl
 
 
 def profiled(table: jax.Array, timestep: float, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
-    """[T, U] what the servos' own profiles make of a command [T, U]."""
+    """[T, U] the command after the servos' profiles (`Effect.profile`)."""
     for effect in effects:
         if effect.profile is not None:
             table = effect.profile(theta, table, timestep)
     return table
 
 
-def compose(law: Callable, theta: Theta, look: Callable) -> Callable:
-    """What an effect's law makes of a command, look(t) -> [U]."""
-    return lambda time: law(theta, time, look)
+def compose(law: Callable, theta: Theta, command: Callable) -> Callable:
+    """The command t -> [U] after an effect's law."""
+    return lambda time: law(theta, time, command)
 
 
 def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
-    """[U] what the servos are given in place of the command."""
+    """[U] the input of the servos: the command changed by effects (`Effect.servo`)."""
     for effect in effects:
         if effect.servo is not None:
             ctrl = effect.servo(theta, state, ctrl)
@@ -331,12 +356,12 @@ def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[E
 
 
 def changes_friction(effects: Sequence[Effect]) -> bool:
-    """Whether any of the effects changes dry friction, which may depend on what the gears carry."""
+    """Whether an effect changes dry friction, which may depend on the torques of the gears."""
     return any(effect.frictionloss is not None for effect in effects)
 
 
 def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
-    """The model with the friction losses that effects give it in this state."""
+    """The model with the friction losses of effects in this state."""
     loss = model.dof_frictionloss
     for effect in effects:
         if effect.frictionloss is not None:
@@ -347,9 +372,9 @@ def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect])
 def apply_forces(
     theta: Theta, state: State, effects: Sequence[Effect], error: jax.Array | None = None
 ) -> Callable[[Any], jax.Array] | None:
-    """The forces of effects in this state, and of a gravity compensation that goes by encoders: of the pose, [nv].
+    """pose -> [nv] N m (N) of effects in this state and of gravity compensation at wrong positions; None if none acts.
 
-    error: [nv] by which joints stand further than their encoders say, None for nothing.
+    error: [nv] joint position minus encoder reading, rad (m); None: 0.
     """
     laws = [effect.force for effect in effects if effect.force is not None]
     if not laws and error is None:
@@ -364,7 +389,7 @@ def apply_forces(
 
 
 def apply_sensor_model(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
-    """What the sensors make of a rollout, and the verdict on finiteness."""
+    """The rollout after the sensor effects (`Effect.observe`), with `finite`."""
     for effect in effects:
         if effect.observe is not None:
             rollout = effect.observe(theta, rollout)
@@ -374,7 +399,7 @@ def apply_sensor_model(rollout: Rollout, theta: Theta, effects: Sequence[Effect]
 
 
 def torque_offset_effect(joints: Sequence[str]) -> Effect:
-    """Constant torque-sensor errors: reads `torque_offset[joint]` from theta, N m; absent means zero."""
+    """The effect of constant torque-sensor errors, `torque_offset[joint]` of theta, N m; 0 if theta lacks it."""
 
     def observe(theta: Theta, rollout: Rollout) -> Rollout:
         return replace(rollout, torque=rollout.torque + column(theta, Role.TORQUE_OFFSET.value, joints))
@@ -383,12 +408,12 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
 
 
 def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
-    """[J] what the torque sensor reads: the motor's torque, or what reaches the link.
+    """[J] N m, torque on the side of the drive's convention: the motor's, or the one that reaches the link.
 
-    servo: [nv] N m, the actuators' forces of the step.
-    Between the two lie rotor inertia (armature) and the damping and dry friction of the joint, as
-    the step integrated them: with the velocity's difference over the step, and its mean (the C
-    engine: its end).
+    The link side excludes rotor inertia (armature) and the damping and dry friction of the joint, as the step
+    integrated them: with the velocity's difference over the step, and its mean (in the C engine its end).
+
+    servo: [nv] N m, the actuators' forces in the step.
     """
     torque = servo[joints]
     if drive.torque.side is TorqueSide.LINK:
@@ -403,20 +428,20 @@ def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, dr
 
 
 def finger_geoms(scene: Scene) -> tuple[np.ndarray, ...]:
-    """For each finger, [pairs, 2] the sorted geom ids of its contact pairs."""
+    """For each finger, [pairs, 2] sorted geom ids of its contact pairs."""
     both = np.sort(np.stack([scene.model.pair_geom1, scene.model.pair_geom2], axis=1), axis=1)
     return tuple(both[pairs] for pairs in scene.finger_pairs)
 
 
 def of_fingers(found: Contacts, fingers: Sequence[np.ndarray]) -> list[jax.Array]:
-    """For each finger, [contacts] bool: which of MJX's contacts are of its pairs, as `finger_geoms` has them."""
+    """For each finger, [contacts] bool: the MJX contacts that belong to its pairs (`finger_geoms`)."""
     geoms = jnp.sort(found.geoms, axis=1)  # [contacts, 2]
     return [jnp.any(jnp.all(geoms[:, None] == pairs[None], axis=-1), axis=1) for pairs in fingers]
 
 
 def _touching(data, fingers: Sequence[np.ndarray]) -> jax.Array:
-    """[F] bool: does any contact of a finger's pairs penetrate?"""
+    """[F] bool: whether a contact of a finger's pairs penetrates."""
     if not fingers:
         return jnp.zeros((0,), bool)
     found = contacts(data)
-    return jnp.stack([jnp.any(mine & (found.distance < 0)) for mine in of_fingers(found, fingers)])
+    return jnp.stack([jnp.any(of_finger & (found.distance < 0)) for of_finger in of_fingers(found, fingers)])

@@ -1,9 +1,10 @@
-"""Which samples of a measured motion are at rest, where dry friction is no function of the speed.
+"""Samples of a measured motion at rest, where the speed does not determine dry friction.
 
-A joint that stands still may be held by any friction between -Fc and Fc.  Below some speed a log does not tell
-whether a joint moves, nor in which direction: because of the noise of the measured positions, because friction of real
-joints (and MuJoCo's soft friction constraint) changes over gradually, or because the joint really holds.  Samples
-below that speed count as at rest: they are compared with the interval of friction, all others with sign(speed) Fc.
+At rest dry friction takes any value between -Fc and Fc.  Below some speed a log does not show whether a joint moves, or
+in which direction: measured positions are noisy, and the friction of real joints (and of MuJoCo's soft constraint)
+changes gradually with speed.  Samples below that speed count as at rest and are compared with the interval of friction.
+All others are compared with sign(speed) Fc.
+
 Source: the set-valued law of dry friction, e.g. Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical
 Systems, 2008, ch. 1.
 """
@@ -21,26 +22,29 @@ import scipy
 from droid_jax.arguments import check_fields, number
 from droid_jax.recordings.recording import Recording
 
-SHORTEST = 30  # samples that the torques' low-pass pads itself with
+FILTER_PADDING = 30  # samples with which `sosfiltfilt` pads the torques; shorter series are not filtered
 
 
 @dataclass(frozen=True)
 class RestConfig:
-    """When a sample of a joint counts as at rest, and how exactly the interval of its friction is known.
+    """When a sample of a joint counts as at rest, and by how much a torque at rest may leave its friction interval.
 
-    A joint is at rest while it is slower than the largest of three speeds:
-    speed: rad/s (m/s of a slide); gears preslide about as long.
-    noise: times the standard deviation of the smoothed speed's noise, which is estimated from the positions.
-    share: of the joint's RMS speed.  It costs 3 % of a sine's samples and covers friction that changes over gradually,
-      as MuJoCo's soft friction constraint does (below it, friction of 0.4 N m came out wrong by 6 deviations).
-    stop: periods of the position's low-pass for which a joint that has stopped is at rest; shorter, it turns round.
-      Widened as a stop is, turns take so much of a log that noise which is correlated pulls friction up.
-    settle: periods before and after such a stop, for which smoothed accelerations are wrong because friction jumps.
-      Of 100 synthetic hinges the 90 % intervals held damping, friction and armature in 83, 80 and 55 at 1, in 89, 86
-      and 72 at 2 (least squares on the same samples), at 3 no more.
-    tolerance: standard deviations of the torques' noise by which a torque at rest may leave the interval: noise at its
-      edge would pull the friction up otherwise.
-    Measured on 100 synthetic hinges, `experiments/friction_at_rest.py`.
+    A joint is at rest while it is slower than the largest of three speeds: `speed`, `noise` and `share`.  The defaults
+    come from 100 synthetic hinges (`experiments/friction_at_rest.py`).
+
+    Attributes:
+        speed: rad/s (m/s of a slide), about the presliding speed of gears.
+        noise: standard deviations of the smoothed speed's noise, which is estimated from the positions.
+        share: of the joint's RMS speed.  It excludes 3 % of a sine's samples and covers friction that changes gradually
+            with speed, as MuJoCo's soft constraint.  With a smaller share, friction of 0.4 N m was wrong by 6 standard
+            deviations.
+        stop: periods of the position's low-pass that a slow phase must last to count as a stop.  Shorter phases are
+            turning points, which are not widened by `settle`: widened, correlated noise biases friction upwards.
+        settle: periods before and after a stop that count as at rest too, since friction jumps there and smoothed
+            accelerations are wrong.  90 % intervals covered damping, friction and armature of 83, 80 and 55 % of the
+            hinges at 1, and of 89, 86 and 72 % at 2.  3 brought no further gain.
+        tolerance: standard deviations of the torques' noise by which a torque at rest may leave the interval.  Without
+            it, noise at the edge of the interval biases friction upwards.
     """
 
     speed: float = 0.01
@@ -61,7 +65,7 @@ def at_rest(
     """[T, J] bool, samples of a smoothed motion at rest.
 
     Args:
-        position_noise: [J] rad (m), deviation of the white noise of the measured positions.
+        position_noise: [J] rad (m), standard deviation of the white noise of the measured positions.
         velocity: [T, J] rad/s (m/s) of the smoothed motion.
         timestep: s, of the motion.
         rate: Hz, of the measured positions.
@@ -76,30 +80,30 @@ def at_rest(
         ]
     )
     slow = np.abs(velocity) < slowest
-    lasts = math.ceil(config.stop / cutoff / timestep)
-    around = 2 * math.ceil(config.settle / cutoff / timestep) + 1
-    edge = lasts // 2 + 1  # a stop at an end of the log may go on outside of it
-    stopped = scipy.ndimage.binary_opening(np.pad(slow, ((edge, edge), (0, 0)), "edge"), np.ones((lasts, 1)))
-    return slow | scipy.ndimage.binary_dilation(stopped, np.ones((around, 1)))[edge:-edge]
+    duration = math.ceil(config.stop / cutoff / timestep)
+    width = 2 * math.ceil(config.settle / cutoff / timestep) + 1
+    edge = duration // 2 + 1  # a stop at an end of the log may extend beyond it
+    stopped = scipy.ndimage.binary_opening(np.pad(slow, ((edge, edge), (0, 0)), "edge"), np.ones((duration, 1)))
+    return slow | scipy.ndimage.binary_dilation(stopped, np.ones((width, 1)))[edge:-edge]
 
 
 def white_noise(high: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
-    """[J] deviation of the white noise of a signal, from what a low-pass took off it.
+    """[J] standard deviation of a signal's white noise, estimated from the residual of a low-pass.
 
     Args:
         high: [T, J] the signal minus its low-pass.
         rate: Hz, of the signal.
         cutoff: Hz, of the low-pass.
     """
-    above = max(1.0 - 2.0 * cutoff / rate, 1e-3)  # share of the band that `high` holds
-    return np.median(np.abs(high), axis=0) / 0.6745 / np.sqrt(above)  # robust: blows are no noise
+    band = max(1.0 - 2.0 * cutoff / rate, 1e-3)  # share of the signal's band above the cutoff
+    return np.median(np.abs(high), axis=0) / 0.6745 / np.sqrt(band)  # the median is robust against impacts
 
 
 def derivative_noise(white: np.ndarray, order: int, rate: float, cutoff: float) -> np.ndarray:
-    """[J] deviation of the noise of a smoothed signal's derivative of an order, 0 for the signal itself.
+    """[J] standard deviation of the noise of a smoothed signal's derivative of order `order` (0: the signal).
 
-    White noise of a deviation s at `rate` Hz has the density 2 s^2 / rate; below `cutoff` Hz its derivative of order n
-    has the variance 2 s^2 / rate * (2 pi)^(2 n) * cutoff^(2 n + 1) / (2 n + 1).
+    White noise with standard deviation s at `rate` Hz has the spectral density 2 s^2 / rate.  Below `cutoff` Hz its
+    n-th derivative has the variance 2 s^2 / rate * (2 pi)^(2 n) * cutoff^(2 n + 1) / (2 n + 1).
     """
     power = 2 * order + 1
     return white * (2.0 * np.pi) ** order * np.sqrt(2.0 / rate * cutoff**power / power)
@@ -108,10 +112,10 @@ def derivative_noise(white: np.ndarray, order: int, rate: float, cutoff: float) 
 def torque_at(
     recording: Recording, joints: Sequence[str], clock: np.ndarray, cutoff: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean measured torque of `joints` at times `clock` [T] s, and the deviation of its noise.
+    """Mean measured torque of `joints` at times `clock` [T] s, and the standard deviation of its noise.
 
-    The mean of the repeats passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz first, where its rate
-    allows, so that samples of another clock hold no aliased noise.  Gaps are bridged by lines.
+    If the rate allows, the mean of the repeats passes a zero-phase Butterworth filter of order 4 at `cutoff` Hz.  So
+    resampling to the clock does not alias noise.  Gaps are interpolated linearly.
 
     Returns:
         [T, J] N m (N for slides), NaN for joints whose torque was not measured, and [J] N m (N).
@@ -127,12 +131,12 @@ def torque_at(
             continue
         column = channel.columns.index(joint)
         values, mask = channel.values[:, :, column], channel.mask[:, :, column]
-        seen = mask.any(axis=0)
-        if seen.sum() < 2:
+        measured = mask.any(axis=0)
+        if measured.sum() < 2:
             continue
-        mean = np.sum(np.where(mask, values, 0.0), axis=0)[seen] / mask.sum(axis=0)[seen]
-        series = np.interp(channel.time, channel.time[seen], mean)
-        if sections is not None and len(series) > SHORTEST:
+        mean = np.sum(np.where(mask, values, 0.0), axis=0)[measured] / mask.sum(axis=0)[measured]
+        series = np.interp(channel.time, channel.time[measured], mean)
+        if sections is not None and len(series) > FILTER_PADDING:
             smoothed = scipy.signal.sosfiltfilt(sections, series)
             white = white_noise(series - smoothed, rate, cutoff)
             noise[j], series = derivative_noise(white, 0, rate, cutoff), smoothed

@@ -1,4 +1,4 @@
-"""The fitted demonstration, opened further: how the hand has to move on around the object's joint."""
+"""Extrapolate a demonstration in the workspace: the hand moves the object a third further around its joint."""
 
 from __future__ import annotations
 
@@ -15,17 +15,24 @@ from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
 from droid_jax.simulate.hand_path import minimum_jerk, solve_pose
 
 FURTHER = "the same motion, opened a third further"
-SHARE = 1 / 3  # of the way the object went
-MARGIN = 0.05  # rad or m that a joint keeps from the ends of its range
-KNOTS = 20  # poses of the hand between the old end and the new one
+SHARE = 1 / 3  # additional motion of the object, as a share of its motion
+MARGIN = 0.05  # rad or m, least distance of a joint from the ends of its range
+KNOTS = 20  # poses of the hand in the additional motion
 
 
 def opened_further(scene: Scene, recording: Recording, replayed: Rollout) -> Recording | None:
-    """The recording as if the hand had gone on where the object was open most, and come back before it went on.
+    """The recording with an additional motion: where the object was open most, the hand opens it further and returns.
 
-    replayed: of one model, [T, ...] from time 0 on, which says where the arm and the object were.
-    The hand keeps its pose on the object (inverse kinematics), the servo's error stays what it was, and the pace is
-    that of the middle of the opening.  None where no hand holds the object then, or it is out of reach.
+    Inverse kinematics keeps the hand's pose relative to the object.  The servo's error is unchanged.  The speed is that
+    of the middle of the opening.
+
+    Args:
+        scene: with the object.
+        recording: with commands.
+        replayed: its replay with one model, [T, ...] from time 0.
+
+    Returns:
+        The longer recording; None if no hand holds the object at its largest opening, or the motion is out of reach.
     """
     if scene.object_joint is None or (hand := _hand(scene)) is None:
         return None
@@ -51,14 +58,14 @@ def opened_further(scene: Scene, recording: Recording, replayed: Rollout) -> Rec
     columns = [recording.command_names.index(j) for j in scene.joints]
     command[:, columns] += step
     gains = recording.gains
-    if gains is not None and gains.damping is not None:  # a servo without a velocity reference stays behind by as much
+    if gains is not None and gains.damping is not None:  # the lag of a servo without a velocity reference
         lag = (gains.damping / gains.stiffness)[columns]
         command[:, columns] += lag * np.gradient(step, longer.time, axis=0)
     return replace(longer, command=command)
 
 
 def _hand(scene: Scene) -> str | None:
-    """The body of the last measured joint before the fingers that hold the object; None where nothing holds it."""
+    """The body of the last measured joint before the fingers that hold the object; None if nothing holds it."""
     model, of_joints = scene.model, {int(scene.model.jnt_bodyid[scene.id("joint", j)]) for j in scene.joints}
     for pair in np.concatenate([*scene.finger_pairs, np.zeros(0, int)]):
         for geom in (model.pair_geom1[pair], model.pair_geom2[pair]):
@@ -71,17 +78,20 @@ def _hand(scene: Scene) -> str | None:
 
 
 def _path(scene: Scene, hand: str, q: np.ndarray, angles: np.ndarray) -> np.ndarray | None:
-    """[K, J] joint positions from q [J] that keep the hand where it is on the object; None out of reach."""
+    """[K, J] joint positions from q [J] that keep the hand's pose relative to the object at angles [K] of its joint.
+
+    None if a joint would come too close to an end of its range.
+    """
     model, data = scene.model, mujoco.MjData(scene.model)
     joint = scene.id("joint", str(scene.object_joint))
     if _outside(model, np.array([joint]), angles[-1:]):
         return None
-    held = int(model.jnt_bodyid[joint])
+    moved = int(model.jnt_bodyid[joint])
 
     def object_pose(angle: float) -> tuple[np.ndarray, np.ndarray]:
         data.qpos[scene.qpos(str(scene.object_joint))] = angle
         mujoco.mj_kinematics(model, data)
-        return data.xpos[held].copy(), data.xmat[held].reshape(3, 3).copy()
+        return data.xpos[moved].copy(), data.xmat[moved].reshape(3, 3).copy()
 
     data.qpos[scene.joint_qpos] = q
     at, frame = object_pose(angles[0])
@@ -99,15 +109,15 @@ def _path(scene: Scene, hand: str, q: np.ndarray, angles: np.ndarray) -> np.ndar
 
 
 def _outside(model: mujoco.MjModel, joints: np.ndarray, positions: np.ndarray) -> bool:
-    """Whether positions [..., J] come near the ends of ranges."""
+    """Whether positions [..., J] come within MARGIN of the ends of the joints' ranges."""
     low, high = model.jnt_range[joints].T
     beyond = (positions < low + MARGIN) | (positions > high - MARGIN)
     return bool(np.any(beyond & model.jnt_limited[joints].astype(bool)))
 
 
 def _seconds(time: np.ndarray, angle: np.ndarray) -> float:
-    """Duration of a third more at a peak speed that is the mean one of the middle four fifths of the opening."""
-    way = np.abs(angle) / np.abs(angle[-1])
-    begin, end = (time[int(np.argmax(way >= share))] for share in (0.1, 0.9))
-    peak = 1.875  # of minimum jerk, over its mean speed
+    """s, duration of the additional opening; its peak speed is the mean speed of the middle 80 % of the opening."""
+    progress = np.abs(angle) / np.abs(angle[-1])
+    begin, end = (time[int(np.argmax(progress >= share))] for share in (0.1, 0.9))
+    peak = 1.875  # peak speed of minimum jerk over its mean speed
     return float(peak * SHARE * (end - begin) / 0.8)

@@ -1,7 +1,7 @@
-"""Hidden friction in joints: N m, speeds in rad/s, on measured joints or (by name) on the hinge.
+"""Hidden friction in measured joints, or (by name) in the hinge.  Torques in N m, speeds in rad/s.
 
-Dry friction is given to MuJoCo as friction loss, so that a joint at rest sticks; only the bristle
-model applies its torque itself.  Every formula takes numbers or arrays.
+Dry friction is MuJoCo's friction loss, so that a joint at rest sticks.  Only bristle models apply a torque themselves.
+Every formula takes numbers or arrays.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import numpy as np
 
 from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place
 
-FIRM_REACH = 0.0005  # rad, over which firm friction sets in
-FIRM_SPEED = 0.02  # rad/s, above which it is not damped
+FIRM_REACH = 0.0005  # rad, presliding displacement of firm friction
+FIRM_SPEED = 0.02  # rad/s, above which its damper fades
 
 
 def dry_loss(a: float, q: np.ndarray) -> np.ndarray:
-    """a (1 + 0.2 sin(2 q + 0.5)): gears that run a little out of true; a in N m."""
+    """a (1 + 0.2 sin(2 q + 0.5)): friction of slightly eccentric gears; a in N m."""
     return a * (1.0 + 0.2 * np.sin(2.0 * q + 0.5))
 
 
 def stribeck_loss(a: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """a (1 + 0.15 sin(8 q)) / (1 + (v / 0.04)²): what sticking adds to sliding, more of it where teeth are worn.
+    """a (1 + 0.15 sin(8 q)) / (1 + (v / 0.04)²): friction added at low speed, which varies with worn teeth.
 
-    After Hess and Soom (1990), not Stribeck's Gauss.
+    After Hess and Soom (1990), not the Gaussian Stribeck curve.
     """
     return a * (1.0 + 0.15 * np.sin(8.0 * q)) / (1.0 + (v / 0.04) ** 2)
 
@@ -35,25 +35,24 @@ def directional_loss(a: float, v: np.ndarray) -> np.ndarray:
 
 
 def load_loss(a: float, torque: np.ndarray) -> np.ndarray:
-    """a (sqrt(torque² + 1.5²) - 1.5): mesh friction with the load, without a kink at none; a without unit."""
+    """a (sqrt(torque² + 1.5²) - 1.5): mesh friction that grows with the load, smooth at zero; a without unit."""
     return a * (np.sqrt(torque**2 + 1.5**2) - 1.5)
 
 
 def mesh_loss(a: float, motor: np.ndarray, links: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """a (0.6 abs(motor) + 0.4 abs(links)) (1 + 0.5 / (1 + (v / 0.3)²)): teeth that both press; a without unit."""
+    """a (0.6 abs(motor) + 0.4 abs(links)) (1 + 0.5 / (1 + (v / 0.3)²)): friction of loaded teeth; a without unit."""
     return a * (0.6 * np.abs(motor) + 0.4 * np.abs(links)) * (1.0 + 0.5 / (1.0 + (v / 0.3) ** 2))
 
 
 def warm_up_loss(a: float, seconds: float) -> float:
-    """a exp(-seconds / 45): stiff grease that warms up from the first repeat on; a in N m when cold."""
+    """a exp(-seconds / 45): cold grease that warms up from the first repeat on; a in N m when cold."""
     return a * float(np.exp(-seconds / 45.0))
 
 
 def bristle(force: np.ndarray, a: float, v: np.ndarray, h: float) -> np.ndarray:
-    """Dahl's model (1968), dF/dx = a / 0.003 (1 - F sgn(v) / a): the force one step of h s later.
+    """One step of h s of Dahl's model (1968), dF/dx = a / 0.003 (1 - F sgn(v) / a).
 
-    F opposes motion and reaches a after some 0.003 rad (bristles bend before they slip); exact for a speed
-    held over the step.
+    F opposes the motion and approaches a over about 0.003 rad.  The step is exact for constant speed.
     """
     end = a * np.sign(v)
     return end + (force - end) * np.exp(-np.abs(v) * h / 0.003)
@@ -82,13 +81,13 @@ def hide_directional_friction(place: Place, a: float) -> Influence:
 
 
 def hide_warm_up_friction(place: Place, a: float) -> Influence:
-    """Friction loss of `warm_up_loss`, its clock running on from repeat to repeat."""
+    """Friction loss of `warm_up_loss`; its clock starts with the first repeat."""
     before = place.repeat * place.period
     return _friction(place, lambda live: warm_up_loss(a, before + live.data.time))
 
 
 def hide_load_friction(place: Place, a: float) -> Influence:
-    """Friction loss of `load_loss`, of the motor's torque behind a first-order lag of 20 ms (the oil film's)."""
+    """Friction loss of `load_loss` of the motor's torque, with a first-order lag of 20 ms (oil film)."""
     filtered = np.zeros(len(place.dofs))
 
     def step(live: Live) -> None:
@@ -99,7 +98,7 @@ def hide_load_friction(place: Place, a: float) -> Influence:
 
 
 def hide_mesh_friction(place: Place, a: float) -> Influence:
-    """Friction loss of `mesh_loss`, of the last step's motor torque and weight, behind a lag of 10 ms."""
+    """Friction loss of `mesh_loss` of the last step's motor and link torques, with a first-order lag of 10 ms."""
     motor, links = np.zeros(len(place.dofs)), np.zeros(len(place.dofs))
 
     def step(live: Live) -> None:
@@ -124,17 +123,17 @@ def hide_bristle_friction(place: Place, a: float) -> Influence:
 
 
 def hide_firm_friction(place: Place, a: float) -> Influence:
-    """A share a of each joint's own friction loss acts as bristles that hold, in place of a constraint that creeps.
+    """A share a of each joint's friction loss acts by Dahl's model, which holds, in place of a constraint that creeps.
 
-    The bristles are Dahl's, as of `bristle`, and a sixth as long: they bend by half a milliradian and stand.  A damper
-    of 0.7 of the critical one, which fades above 0.02 rad/s, keeps them from ringing.
+    The presliding displacement is FIRM_REACH, a sixth of that of `bristle`.  A damper with 0.7 of critical damping
+    suppresses ringing and fades above FIRM_SPEED.
     """
     if a > 1.0:
-        raise ValueError(f"no more than all of a friction can be firm: an amplitude of at most 1, got {a}")
+        raise ValueError(f"hidden effect 'firm_friction' is a share of the friction, at most 1, got {a}")
     level, damper, force = (np.zeros(len(place.dofs)) for _ in range(3))
 
     def begin(live: Live) -> None:
-        """Of this repeat's own friction and inertia."""
+        """Compute friction and damper from this repeat's model."""
         level[:] = a * live.model.dof_frictionloss[place.dofs]
         damper[:] = 1.4 * np.sqrt(level / FIRM_REACH * live.model.dof_M0[place.dofs])
 
@@ -151,12 +150,12 @@ def hide_firm_friction(place: Place, a: float) -> Influence:
 FRICTION = (
     Hidden("dry_friction", "N m", (0.2, 1.5), "joint", hide_dry_friction, "dry friction that varies with angle"),
     Hidden("stribeck_friction", "N m", (0.3, 2.0), "joint", hide_stribeck_friction, "more friction when slow"),
-    Hidden("directional_friction", "N m", (0.3, 2.0), "joint", hide_directional_friction, "friction one way"),
+    Hidden("directional_friction", "N m", (0.3, 2.0), "joint", hide_directional_friction, "friction in one direction"),
     Hidden("load_friction", "-", (0.03, 0.2), "arm", hide_load_friction, "friction that grows with the load"),
     Hidden(
         "mesh_friction", "-", (0.03, 0.2), "arm", hide_mesh_friction, "gear friction of motor and load, more when slow"
     ),
-    Hidden("bristle_friction", "N m", (0.2, 1.0), "joint", hide_bristle_friction, "friction that bends first"),
+    Hidden("bristle_friction", "N m", (0.2, 1.0), "joint", hide_bristle_friction, "friction with presliding"),
     Hidden("firm_friction", "-", (0.5, 1.0), "joint", hide_firm_friction, "friction that holds and does not creep"),
     Hidden("warm_up_friction", "N m", (0.2, 1.5), "joint", hide_warm_up_friction, "friction fading by repeats"),
 )

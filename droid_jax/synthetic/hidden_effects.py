@@ -1,8 +1,8 @@
-"""Hidden effects on the synthetic robot, for blind tests of the search for a gap.
+"""Record the synthetic robot with hidden effects, for blind tests of the search for missing effects.
 
-Written without knowledge of the library of effects that the search offers: forms, constants and
-time step are the synthetic robot's own.  What was hidden stands nowhere in the recording.  The formulas
-are in `hidden_door`, `hidden_friction`, `hidden_arm`, `hidden_base` and `hidden_signals`.
+Their formulas, constants and time step are independent of the library of effects that the search uses.  A recording
+does not say what was hidden.  The formulas are in `hinge_effects`, `friction_effects`, `arm_effects`, `base_effects`
+and `signal_effects`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from droid_jax.synthetic.arm_effects import ARM_EFFECTS
 from droid_jax.synthetic.base_effects import BASE
 from droid_jax.synthetic.friction_effects import FRICTION
 from droid_jax.synthetic.hinge_effects import DOOR
-from droid_jax.synthetic.hooks import Hidden, Influence, Place, Seen, edited, step_through
+from droid_jax.synthetic.hooks import Hidden, Influence, Place, SensorInput, edited, step_through
 from droid_jax.synthetic.robot import SyntheticRobot, SyntheticRobotConfig, as_recording, sensor_torque, set_up
 from droid_jax.synthetic.signal_effects import SIGNALS
 
 HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *BASE, *SIGNALS)}
-# What the library of effects calls them; what is missing here it has no form of.  No two forms are the same, but of
-# what has one form only (a base that leans, an encoder's zero), which is computed in another way.
+# Hidden effect -> the corresponding effect of the library; effects that are missing here have none.  The formulas
+# differ, except for a tilted base and an encoder's zero, which have one form only and are computed in another way.
 LIBRARY = {
     "hinge_preload": "hinge_preload",
     "binding_spring": "hardening_spring",
@@ -71,17 +71,20 @@ LIBRARY = {
     "torque_gain": "torque_gain",
     "torque_drift": "torque_drift",
 }
-# On a hinge these have a name of their own there.
+# Effect of the library -> its name on the object's hinge.
 ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
-LONGEST_STEP = 0.00025  # s: the explicit torques of hidden effects want a step this short
-PAUSE = 5.0  # s between repeats, for what warms up or drifts
+LONGEST_STEP = 0.00025  # s, for a stable integration of the explicit torques of hidden effects
+PAUSE = 5.0  # s between repeats, for effects that warm up or drift
 
 
 @dataclass(frozen=True)
 class Applied:
-    """One hidden effect at work: amplitude in the effect's unit, on one joint or on all that it can act on.
+    """A hidden effect with its amplitude.
 
-    joint: "" for every measured joint; the hinge's name puts an effect "on" joints there.
+    Attributes:
+        name: of the effect.
+        amplitude: in the effect's unit (`Hidden.unit`).
+        joint: on which it acts; "" for all measured joints.  A friction effect may act on the object's hinge.
     """
 
     name: str
@@ -100,16 +103,26 @@ def record_hidden(
     name: str | None = None,
     space: Space | None = None,
 ) -> Recording:
-    """Like `robot.record`, with effects that no parameter of the model stands for.
+    """Record the synthetic robot with effects that the model has no parameters for.
 
-    effects: amplitudes by name, or by "name[joint]"; or `Applied`.
-    config: time steps of more than LONGEST_STEP are refused.
-    space: what truth may speak of; the default is a held door's parameters, else offsets and timing.
-    Without effects the recording equals `record`'s with the same config bit for bit: the same steps
-    of the same model, taken one by one.
-    On the link side the torque has passed what the effects put into the gears: friction added to
-    measured joints, ripple.
-    Raises ValueError for unknown names, joints or amplitudes, and like `record`.
+    Without effects the recording equals that of `robot.record` with the same configuration bit for bit.  A link-side
+    torque includes what effects add in the gears: friction of measured joints and ripple.
+
+    Args:
+        scene: what moves.
+        demonstration: to be repeated.
+        truth: hidden values by parameter name, as for `robot.record`.
+        effects: amplitudes by name or by "name[joint]", or a list of `Applied`.
+        seed: of all randomness.
+        config: of the robot; its time step must be at most LONGEST_STEP.
+        name: of the recording; None: the demonstration's.
+        space: the parameters that truth may name; None: those of a held door, else torque offsets and the time offset.
+
+    Returns:
+        The recording.
+
+    Raises:
+        ValueError: an effect, joint or amplitude is unknown or invalid, or as in `robot.record`.
     """
     config = config or SyntheticRobotConfig()
     if config.timestep > LONGEST_STEP * (1 + 1e-9):
@@ -128,28 +141,28 @@ def record_hidden(
 
 
 def as_applied(effects: Mapping[str, float] | Sequence[Applied]) -> list[Applied]:
-    """Amplitudes by name or by "name[joint]" as effects at work; a list of these as it is."""
+    """Amplitudes by name or by "name[joint]" as a list of `Applied`; a sequence of these is copied."""
     if not isinstance(effects, Mapping):
         return list(effects)
-    found = []
+    applied = []
     for key, amplitude in effects.items():
         match = re.fullmatch(r"([^\[\]]*)(?:\[(.+)\])?", key)
-        found.append(Applied(match[1], amplitude, match[2] or "") if match else Applied(key, amplitude))
-    return found
+        applied.append(Applied(match[1], amplitude, match[2] or "") if match else Applied(key, amplitude))
+    return applied
 
 
 def in_words(hide: Sequence[str]) -> str:
-    """["magnetic_catch=1.5"] -> "magnetic catch (1.5 N m; in the library: latch)"; empty for nothing."""
-    said = []
+    """["magnetic_catch=1.5"] -> "magnetic catch (1.5 N m; in the library: latch)"; empty for an empty list."""
+    phrases = []
     for entry in hide:
         name, _, amplitude = entry.partition("=")
-        kind, _, joint = name.rstrip("]").partition("[")
-        effect, called = HIDDEN.get(kind), LIBRARY.get(kind, "")
-        called = ON_HINGE.get(called, called) if joint == HINGE else called
+        effect_name, _, joint = name.rstrip("]").partition("[")
+        effect, in_library = HIDDEN.get(effect_name), LIBRARY.get(effect_name, "")
+        in_library = ON_HINGE.get(in_library, in_library) if joint == HINGE else in_library
         size = f"{amplitude} {effect.unit}".removesuffix(" -") if effect else amplitude
-        library = f"in the library: {label(called).lower()}" if called else "the library has no form of it"
-        said.append(f"{label(name).lower()} ({size}; {library})")
-    return enumerated(said)
+        library = f"in the library: {label(in_library).lower()}" if in_library else "not in the library"
+        phrases.append(f"{label(name).lower()} ({size}; {library})")
+    return enumerated(phrases)
 
 
 def hidden_effect(name: str) -> Hidden:
@@ -165,7 +178,7 @@ def possible(scene: Scene) -> tuple[str, ...]:
 
 
 def _lacks(effect: Hidden, scene: Scene) -> str | None:
-    """What a scene would need and does not have."""
+    """What the effect needs and the scene lacks; None if nothing."""
     if effect.on == "hinge" and not scene.object_joint:
         return "an object joint"
     if effect.on == "base" and not scene.model.opt.gravity.any():
@@ -176,7 +189,7 @@ def _lacks(effect: Hidden, scene: Scene) -> str | None:
 
 
 def check(one: Applied, scene: Scene) -> None:
-    """ValueError for an effect that is unknown, an amplitude it cannot have, a scene or joint it cannot act on."""
+    """Raise ValueError for an unknown effect, an invalid amplitude, or a scene or joint on which it cannot act."""
     effect = hidden_effect(one.name)
     if not math.isfinite(one.amplitude) or (one.amplitude < 0 and not effect.signed):
         least = "a finite" if effect.signed else "a finite, not negative"
@@ -191,7 +204,7 @@ def check(one: Applied, scene: Scene) -> None:
 
 
 def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
-    """Joints an effect can be put on by name."""
+    """Joints on which an effect may act alone."""
     if effect.on == "arm":
         return scene.joints
     if effect.on == "joint":
@@ -199,8 +212,8 @@ def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
     return ()
 
 
-def at_work(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: float = 0.0) -> list[Influence]:
-    """The effects of one repeat, each with a fresh state; repeat and period as in `Place`."""
+def influences_of(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: float = 0.0) -> list[Influence]:
+    """The effects in one repeat, each with a new state; repeat and period as in `Place`."""
     places = [Place(scene, (one.joint,) if one.joint else scene.joints, repeat, period) for one in applied]
     return [HIDDEN[one.name].make(place, one.amplitude) for one, place in zip(applied, places, strict=True)]
 
@@ -208,13 +221,17 @@ def at_work(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: f
 def _simulate(
     synthetic_robot: SyntheticRobot, applied: Sequence[Applied]
 ) -> tuple[np.ndarray, np.ndarray, list[list[Influence]], SyntheticRobot]:
-    """Sensor rows [N, T, S], torques in the gears [N, T, nv] (N m; only for the link side), the
-    effects of every repeat, and the synthetic robot with the models that they edited."""
+    """Simulate all repeats.
+
+    Returns:
+        Sensor values [N, T, S]; torques of effects in the gears [N, T, nv], N m (no rows for motor-side torques); the
+        effects of each repeat; the synthetic robot with the models that they edited.
+    """
     count = len(synthetic_robot.models)
     since = synthetic_robot.clock - synthetic_robot.clock[0]
     period = float(since[-1]) + PAUSE
-    effects = [at_work(synthetic_robot.scene, applied, repeat, period) for repeat in range(count)]
-    models = [edited(model, own) for model, own in zip(synthetic_robot.models, effects, strict=True)]
+    effects = [influences_of(synthetic_robot.scene, applied, repeat, period) for repeat in range(count)]
+    models = [edited(model, influences) for model, influences in zip(synthetic_robot.models, effects, strict=True)]
     link = synthetic_robot.config.side is TorqueSide.LINK
     gears = np.zeros((count, len(synthetic_robot.clock) if link else 0, synthetic_robot.scene.model.nv))
 
@@ -223,8 +240,8 @@ def _simulate(
         for influence in effects[repeat]:
             if influence.command:
                 control = influence.command(since, control)
-        qpos0, own = synthetic_robot.qpos0[repeat], gears[repeat] if link else None
-        return step_through(models[repeat], qpos0, control, effects[repeat], own)
+        qpos0, in_gears = synthetic_robot.qpos0[repeat], gears[repeat] if link else None
+        return step_through(models[repeat], qpos0, control, effects[repeat], in_gears)
 
     with ThreadPoolExecutor(max_workers=min(count, runtime.cores())) as pool:
         rows = np.stack(list(pool.map(one, range(count))))
@@ -234,11 +251,11 @@ def _simulate(
 def _sensed(
     synthetic_robot: SyntheticRobot, effects: Sequence[Sequence[Influence]], torque: np.ndarray, position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Torque and position [N, T, J] behind the effects on the sensors."""
-    seen = []
-    for repeat, own in enumerate(effects):
-        now = Seen(synthetic_robot.clock - synthetic_robot.clock[0], torque[repeat], position[repeat])
-        for influence in own:
-            now = influence.sense(now) if influence.sense else now
-        seen.append(now)
-    return np.stack([s.torque for s in seen]), np.stack([s.position for s in seen])
+    """Torque and position [N, T, J] after the effects on the sensors."""
+    sensed = []
+    for repeat, influences in enumerate(effects):
+        signals = SensorInput(synthetic_robot.clock - synthetic_robot.clock[0], torque[repeat], position[repeat])
+        for influence in influences:
+            signals = influence.sense(signals) if influence.sense else signals
+        sensed.append(signals)
+    return np.stack([s.torque for s in sensed]), np.stack([s.position for s in sensed])

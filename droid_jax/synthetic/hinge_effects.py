@@ -1,7 +1,7 @@
 """Hidden effects on a door's hinge.  Angle in rad from closed, speed in rad/s, torque in N m, positive opens.
 
-Each formula is a pure function of amplitude, angle and speed where it can be; its numbers are
-those of ordinary cabinet hardware and stand beside it.
+A formula without state is a pure function of amplitude a, angle q and speed v.  The numbers are typical of cabinet
+hardware.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, hinge_loss, hinge_torque
 
-BENT = 0.25  # of a leaning door's torque: hinges that are not in line
+BENT = 0.25  # share of a tilted door's torque that misaligned hinges add
 
 
 def preload(a: float, q: float, v: float) -> float:
@@ -22,7 +22,7 @@ def preload(a: float, q: float, v: float) -> float:
 
 
 def binding_spring(a: float, q: float, v: float) -> float:
-    """-a s ln(1 + exp((q - 0.45) / s)): a second spring that the door meets at 0.45 rad, rounded over s = 0.02 rad.
+    """-a s ln(1 + exp((q - 0.45) / s)): a second spring that engages at 0.45 rad, smoothed over s = 0.02 rad.
 
     a in N m/rad.
     """
@@ -45,19 +45,19 @@ def over_centre(a: float, q: float, v: float) -> float:
 
 
 def magnetic_catch(a: float, q: float, v: float) -> float:
-    """-a (1 / (1 + (q / 0.03)²) - 0.12 exp(-((q - 0.14) / 0.04)²)): pulls in; further out its ring of iron pushes.
+    """-a (1 / (1 + (q / 0.03)²) - 0.12 exp(-((q - 0.14) / 0.04)²)): a magnet attracts, further out it repels.
 
-    0.03 rad are 9 mm of gap at a lever of 0.3 m; a closed door (or one pressed in) has the full a, N m.
+    0.03 rad are 9 mm of gap at a lever of 0.3 m.  a in N m at the closed door (and for q < 0).
     """
     q = max(q, 0.0)
     return -a * (1.0 / (1.0 + (q / 0.03) ** 2) - 0.12 * math.exp(-(((q - 0.14) / 0.04) ** 2)))
 
 
 def closer(a: float, q: float, v: float) -> float:
-    """a z(q) (|v| / 0.3)^1.6 while closing, nothing while opening: oil through a valve, and a check ball.
+    """a z(q) (|v| / 0.3)^1.6 while closing, zero while opening: an oil damper with a check valve.
 
-    The latch valve below 0.15 rad is further open: z = 0.35 + 0.65 σ((q - 0.15) / 0.02), σ the logistic
-    function.  a in N m at 0.3 rad/s.
+    The valve opens further below 0.15 rad: z = 0.35 + 0.65 σ((q - 0.15) / 0.02), σ the logistic function.  a in N m at
+    0.3 rad/s.
     """
     if v >= 0.0:
         return 0.0
@@ -72,7 +72,7 @@ def check_at_end(a: float, q: float, v: float) -> float:
 
 
 def air_drag(a: float, q: float, v: float) -> float:
-    """-a (1 + 1.5 exp(-q / 0.12)) v |v|: drag of a panel, more of it where air must pass a narrow gap.
+    """-a (1 + 1.5 exp(-q / 0.12)) v |v|: air drag of a panel, larger when the gap to the frame is narrow.
 
     a in N m s²/rad².
     """
@@ -80,18 +80,18 @@ def air_drag(a: float, q: float, v: float) -> float:
 
 
 def detent(a: float, q: float, v: float) -> float:
-    """-a x exp((1 - x²) / 2), x = (q - 0.50) / w: a ball in a worn groove, w = 0.04 rad before and 0.06 behind it.
+    """-a x exp((1 - x²) / 2), x = (q - 0.50) / w: a ball in a worn groove; w is 0.04 rad below q = 0.50, 0.06 above.
 
-    a in N m, the largest torque on both flanks.
+    a in N m, the largest torque on either flank.
     """
     x = (q - 0.50) / (0.04 if q < 0.50 else 0.06)
     return -a * x * math.exp(0.5 * (1.0 - x * x))
 
 
 def neighbour_door(a: float, q: float, v: float) -> float:
-    """-a (d / 0.1)^1.5 (1 + 0.8 v), never pulling, d = q - 0.55: a door that touches another one.
+    """-a (d / 0.1)^1.5 (1 + 0.8 v), d = q - 0.55: contact with another door, which cannot pull.
 
-    Contact after Hunt and Crossley (1975); a in N m at 0.1 rad of penetration.
+    Contact model of Hunt and Crossley (1975); a in N m at 0.1 rad of penetration.
     """
     if q <= 0.55:
         return 0.0
@@ -99,61 +99,61 @@ def neighbour_door(a: float, q: float, v: float) -> float:
 
 
 def floor_friction(a: float, q: float) -> float:
-    """a (0.6 σ((q - 0.30) / 0.03) + 0.4 σ((q - 0.60) / 0.04)): the door meets the floor, then a carpet's edge.
+    """a (0.6 σ((q - 0.30) / 0.03) + 0.4 σ((q - 0.60) / 0.04)): the door drags on the floor, then on a carpet.
 
-    σ is the logistic function; a in N m of friction once both are met.
+    σ is the logistic function; a in N m, friction loss of both.
     """
     return a * (0.6 * _logistic((q - 0.30) / 0.03) + 0.4 * _logistic((q - 0.60) / 0.04))
 
 
 def pin_wobble(a: float, q: float) -> float:
-    """a cos⁴(5.5 q + 0.35): a bent pin that binds in its knuckles twice a revolution of 11; a in N m of friction."""
+    """a cos⁴(5.5 q + 0.35): friction loss of a bent hinge pin, 11 maxima per revolution; a in N m."""
     return a * math.cos(5.5 * q + 0.35) ** 4
 
 
 def hide_tilted_frame(place: Place, a: float) -> Influence:
-    """The frame leans by a rad: axis · (c x M (R g - g)), the door's gravity torque as it turns, on bent hinges.
+    """A frame tilted by a rad: gravity torque axis · (c x M (R g - g)) of the door, plus that of misaligned hinges.
 
-    Its two hinges are not quite in line, so 0.25 of the torque's size comes and goes with the sine of three times
-    the angle turned.  R turns gravity about a horizontal line 30 degrees off the world's x axis (in the built-in
-    scene the door's inward normal: it leans along its panel and a little forward); c is the centre of everything
-    that the hinge carries, M its mass.  A positive lean closes the built-in door; a negative one swings
-    it open before it is grasped unless friction holds it.
+    R turns gravity about a horizontal line 30 degrees off the world's x axis.  In the built-in scene x is the door's
+    inward normal, so the door leans along its panel and a little forward.  c is the centre of mass of the bodies that
+    the hinge carries, M their mass.  The hinges are not aligned, so BENT of the torque's size is added times
+    sin(3 (q - q_start)).  A positive tilt closes the built-in door.  A negative tilt opens it before it is grasped,
+    unless friction holds it.
     """
     q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
-    start = [0.0, 0.0, 0.0]  # angle, and the torques before cosine and sine
+    start = [0.0, 0.0, 0.0]  # angle, and the coefficients of cosine and sine
 
     def begin(live: Live) -> None:
         torques = lean_torque(live.model, live.data, place.scene.id("joint", place.hinge), a)
         start[:] = [float(live.position[q]), *torques]
 
     def step(live: Live) -> None:
-        turned = float(live.position[q]) - start[0]
-        bent = BENT * math.hypot(*start[1:]) * math.sin(3.0 * turned)
-        live.applied[v] += start[1] * math.cos(turned) + start[2] * math.sin(turned) + bent
+        angle = float(live.position[q]) - start[0]
+        bent = BENT * math.hypot(*start[1:]) * math.sin(3.0 * angle)
+        live.applied[v] += start[1] * math.cos(angle) + start[2] * math.sin(angle) + bent
 
     return Influence(begin=begin, step=step)
 
 
 def lean_torque(model: mujoco.MjModel, data: mujoco.MjData, joint: int, lean: float) -> list[float]:
-    """N m before the cosine and the sine of the angle turned since data's pose, for a lean in rad."""
+    """Coefficients, N m, of the cosine and the sine of the angle from the pose in `data`, for a tilt in rad."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     body = int(model.jnt_bodyid[joint])
     axis, arm = data.xaxis[joint], data.subtree_com[body] - data.xanchor[joint]
     line = -np.array([math.cos(math.pi / 6), math.sin(math.pi / 6), 0.0])
     g = model.opt.gravity
-    # Rodrigues' rotation, less the vector itself; all of it vanishes exactly with the lean
+    # Rodrigues' rotation minus the vector; exactly zero for no tilt
     extra = np.cross(line, g) * math.sin(lean) + np.cross(line, np.cross(line, g)) * (1.0 - math.cos(lean))
     weight = float(model.body_subtreemass[body]) * extra
     return [float(axis @ np.cross(arm, weight)), float(axis @ np.cross(np.cross(axis, arm), weight))]
 
 
 def hide_gasket(place: Place, a: float) -> Influence:
-    """-a s: a seal that holds the door by suction, s in 0..1 with a memory; a in N m.
+    """-a s: a seal that holds the door by suction, with a state s in 0..1; a in N m.
 
-    s' = max(v, 0) / 0.015 (1 - s) - s / T: opening stretches the gap under the seal, air leaks in with
-    T = 0.5 s, or 8 ms once the lip has let go at 0.05 rad.
+    s' = max(v, 0) / 0.015 (1 - s) - s / T.  Opening widens the gap under the seal.  Air leaks in with T = 0.5 s, or
+    8 ms from 0.05 rad on, where the seal detaches.
     """
     q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
     state = [0.0]
@@ -166,7 +166,7 @@ def hide_gasket(place: Place, a: float) -> Influence:
 
 
 def suction(s: float, q: float, v: float, h: float) -> float:
-    """The seal's state one step of h s later, exact for angle and speed held over the step."""
+    """One step of h s of the seal's state, exact for constant angle and speed."""
     grow, leak = (max(v, 0.0) / 0.015 if q < 0.05 else 0.0), 1.0 / (0.5 if q < 0.05 else 0.008)
     end = grow / (grow + leak)
     return end + (s - end) * math.exp(-(grow + leak) * h)
@@ -192,6 +192,6 @@ DOOR = (
     Hidden("tilted_frame", "rad", (0.02, 0.15), "hinge", hide_tilted_frame, "the frame is out of plumb", signed=True),
     Hidden("detent", "N m", (0.3, 1.5), "hinge", hinge_torque(detent), "a ball detent half-way; in no library"),
     Hidden("pin_wobble", "N m", (0.2, 1.5), "hinge", hinge_loss(pin_wobble), "a bent hinge pin; in no library"),
-    Hidden("gasket", "N m", (0.3, 2.0), "hinge", hide_gasket, "a seal that sucks; in no library"),
+    Hidden("gasket", "N m", (0.3, 2.0), "hinge", hide_gasket, "a seal that holds by suction; in no library"),
     Hidden("neighbour_door", "N m", (0.1, 0.5), "hinge", hinge_torque(neighbour_door), "another door; in no library"),
 )

@@ -1,7 +1,7 @@
-"""Where a hidden effect takes hold of the synthetic robot, and the loop of mj_step around it.
+"""The interface of hidden effects, and the loop of mj_step that calls them.
 
-Nothing here knows the library of effects with which a gap is searched: what is hidden must have
-been written without it, or a blind test would test nothing.
+Nothing here uses the library of effects of the search for missing effects.  A blind test is only valid if the hidden
+effects were written independently.
 """
 
 from __future__ import annotations
@@ -23,8 +23,11 @@ from droid_jax.recordings.clocks import interpolate
 class Place:
     """What one effect acts on in one repeat.
 
-    scene: the instrumented scene.  joints: what a joint effect acts on.  repeat: counts from 0.
-    period: s from the start of a repeat to that of the next one, pause included.
+    Attributes:
+        scene: the instrumented scene.
+        joints: on which a joint effect acts.
+        repeat: number, from 0.
+        period: s from the start of a repeat to the start of the next, including the pause.
     """
 
     scene: Scene
@@ -63,11 +66,20 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Live:
-    """A running simulation, as views into MuJoCo's own memory.
+    """A running simulation, as views into MuJoCo's memory.
 
-    Before each step `control` holds the command, `applied` and `gear` zeros and `loss` the model's
-    own friction loss; an effect changes them.  `gear` is the part of `applied` between motor and
-    link, which a sensor on the link side sees.  `motor` is the last step's torque.
+    Before each step `control` is the command, `applied` and `gear` are zero, and `loss` is the model's friction loss;
+    effects change them.
+
+    Attributes:
+        model, data: of the simulation.
+        timestep: s.
+        position, velocity: [nq], [nv] rad, rad/s (m, m/s).
+        applied: [nv] N m (N), applied forces (qfrc_applied).
+        loss: [nv] N m (N), friction loss.
+        motor: [nv] N m (N), actuator forces of the last step.
+        control: [U] command.
+        gear: [nv] N m (N), the part of `applied` between motor and link, which a link-side sensor measures.
     """
 
     model: mujoco.MjModel
@@ -91,10 +103,13 @@ class Live:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What one repeat's sensors are about to see at the simulation's own steps.
+class SensorInput:
+    """Input of the sensors in one repeat, at the simulation's time steps.
 
-    clock: [T] s from the start of the repeat; torque [T, J] N m; position [T, J] rad.
+    Attributes:
+        clock: [T] s from the start of the repeat.
+        torque: [T, J] N m.
+        position: [T, J] rad.
     """
 
     clock: np.ndarray
@@ -104,30 +119,36 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Influence:
-    """One effect at work in one repeat: any of these, in the order in which they are called.
+    """The functions of one effect in one repeat, in the order of their calls; each may be None.
 
-    edit: changes the model.  command: clock [T] s and command [T, U] -> command.  begin: once,
-    with the start pose set.  step: before each mj_step.  sense: changes what the sensors see.
+    Attributes:
+        edit: changes the model.
+        command: (clock [T] s, command [T, U]) -> command [T, U].
+        begin: is called once, in the start pose.
+        step: is called before each mj_step.
+        sense: changes the input of the sensors.
     """
 
     edit: Callable[[mujoco.MjModel], None] | None = None
     command: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     begin: Callable[[Live], None] | None = None
     step: Callable[[Live], None] | None = None
-    sense: Callable[[Seen], Seen] | None = None
+    sense: Callable[[SensorInput], SensorInput] | None = None
 
 
 @dataclass(frozen=True)
 class Hidden:
     """A hidden effect.
 
-    unit, typical: of its amplitude, and the range in which it is felt but safe on the door and the
-      Panda; zero is exactly no effect.
-    on: "hinge" (the object's joint), "arm" (measured joints), "joint" (measured joints, or the hinge
-      by name), "hand" (the last body), "base" (what the arm stands on), "grip" (contact pairs).
-    make: the effect in one repeat, with a state of its own.
-    what: for lists, in a few words.
-    signed: a negative amplitude has a meaning.
+    Attributes:
+        name: of the effect.
+        unit: of its amplitude; amplitude zero is exactly no effect.
+        typical: range of amplitudes that are noticeable but safe on the door and the Panda.
+        on: "hinge" (the object's joint), "arm" (measured joints), "joint" (measured joints, or the hinge by name),
+            "hand" (the last body), "base" (the arm's mount), "grip" (contact pairs).
+        make: (place, amplitude) -> the effect in one repeat, with a new state.
+        what: description for lists, in a few words.
+        signed: whether a negative amplitude is valid.
     """
 
     name: str
@@ -139,11 +160,11 @@ class Hidden:
     signed: bool = False
 
 
-def under(
+def start_simulation(
     model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence]
 ) -> tuple[Live, Callable[[np.ndarray], None]]:
-    """A simulation that the effects begin to act on, and what takes it one step on with a command [U]."""
-    live, own_loss = Live.of(model, data), model.dof_frictionloss.copy()
+    """Begin the effects; returns the simulation and a function of a command [U] that makes one step."""
+    live, model_loss = Live.of(model, data), model.dof_frictionloss.copy()
     for influence in influences:
         if influence.begin:
             influence.begin(live)
@@ -154,7 +175,7 @@ def under(
         ctrl[:] = command
         applied[:] = 0.0
         gear[:] = 0.0
-        loss[:] = own_loss
+        loss[:] = model_loss
         for step in steps:
             step(live)
         mujoco.mj_step(model, data)
@@ -169,39 +190,47 @@ def step_through(
     influences: Sequence[Influence],
     gears: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Sensor rows [T, S] of one repeat by mj_step; NaN when it blew up.  The model stays as it is.
+    """Simulate one repeat by mj_step.
 
-    gears: [T, nv], filled with what the effects put between motors and links, N m.
+    Args:
+        model: instrumented; it is not changed.
+        qpos0: [nq] start pose.
+        control: [T, U] commands.
+        influences: the effects.
+        gears: [T, nv] an output, N m, torques of effects between motors and links.
+
+    Returns:
+        [T, S] sensor values; all NaN if the simulation diverges.
     """
     model = copy.copy(model)
     data = mujoco.MjData(model)
     data.qpos[:] = qpos0
-    own_loss = model.dof_frictionloss.copy()
-    live, advance = under(model, data, influences)
+    model_loss = model.dof_frictionloss.copy()
+    live, advance = start_simulation(model, data, influences)
     rows, sensors = np.empty((len(control), model.nsensordata)), data.sensordata
     for k, command in enumerate(control):
         advance(command)
         rows[k] = sensors
         if gears is not None:
-            gears[k] = live.gear + _added_friction(data, live.loss, own_loss)
-    # MuJoCo starts over where it blows up: its clock is then late.
+            gears[k] = live.gear + _added_friction(data, live.loss, model_loss)
+    # MuJoCo resets a simulation that diverges: its clock is late then.
     if abs(data.time - len(control) * live.timestep) > 0.5 * live.timestep:
         rows[:] = np.nan
     return rows
 
 
-def _added_friction(data: mujoco.MjData, loss: np.ndarray, own_loss: np.ndarray) -> np.ndarray:
-    """[nv] N m, the effects' share of the dry friction that MuJoCo's last step found."""
+def _added_friction(data: mujoco.MjData, loss: np.ndarray, model_loss: np.ndarray) -> np.ndarray:
+    """[nv] N m, the effects' share of the dry friction in MuJoCo's last step."""
     rows = slice(data.ne, data.ne + data.nf)
     of_joints = data.efc_type[rows] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF
     dofs = data.efc_id[rows][of_joints]
     friction = np.zeros(len(loss))
-    friction[dofs] = data.efc_force[rows][of_joints] * (1.0 - own_loss[dofs] / loss[dofs])
+    friction[dofs] = data.efc_force[rows][of_joints] * (1.0 - model_loss[dofs] / loss[dofs])
     return friction
 
 
 def edited(model: mujoco.MjModel, influences: Sequence[Influence]) -> mujoco.MjModel:
-    """A copy of the model with every effect's changes."""
+    """A copy of the model with the changes of all effects."""
     model = copy.copy(model)
     for influence in influences:
         if influence.edit:
@@ -210,7 +239,7 @@ def edited(model: mujoco.MjModel, influences: Sequence[Influence]) -> mujoco.MjM
 
 
 def hinge_torque(formula: Callable[[float, float, float], float]) -> Callable[[Place, float], Influence]:
-    """An effect out of a formula (amplitude, angle rad, speed rad/s) -> N m on the hinge, positive opens."""
+    """An effect from a formula (amplitude, angle rad, speed rad/s) -> N m on the hinge, positive opens."""
 
     def make(place: Place, amplitude: float) -> Influence:
         q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
@@ -224,7 +253,7 @@ def hinge_torque(formula: Callable[[float, float, float], float]) -> Callable[[P
 
 
 def hinge_loss(formula: Callable[[float, float], float]) -> Callable[[Place, float], Influence]:
-    """An effect out of a formula (amplitude, angle rad) -> N m of friction loss added to the hinge."""
+    """An effect from a formula (amplitude, angle rad) -> N m of friction loss added to the hinge."""
 
     def make(place: Place, amplitude: float) -> Influence:
         q, v = place.scene.qpos(place.hinge), place.scene.dof(place.hinge)
@@ -238,14 +267,14 @@ def hinge_loss(formula: Callable[[float, float], float]) -> Callable[[Place, flo
 
 
 def lagged(values: np.ndarray, clock: np.ndarray, delay: float, lag: float) -> np.ndarray:
-    """Signals [T, C] after a dead time and then a first-order lag, both s; before the start they stood still.
+    """Signals [T, C] after a dead time and then a first-order lag, both in s; constant before the start.
 
-    The lag y' = (x - y) / lag is stepped exactly for an input held over each step.
+    The lag y' = (x - y) / lag is integrated exactly for an input that is constant over each step.
     """
     if delay > 0:
         values = interpolate(clock - delay, clock, values)
     if lag > 0 and len(clock) > 1:
-        keep = np.exp(-(clock[1] - clock[0]) / lag)
-        start = keep * values[:1]
-        values, _ = scipy.signal.lfilter([1 - keep], [1.0, -keep], values, axis=0, zi=start)
+        decay = np.exp(-(clock[1] - clock[0]) / lag)
+        start = decay * values[:1]
+        values, _ = scipy.signal.lfilter([1 - decay], [1.0, -decay], values, axis=0, zi=start)
     return values

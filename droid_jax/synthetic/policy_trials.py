@@ -1,8 +1,7 @@
-"""A policy on the synthetic robot: plain MuJoCo C, a fine time step, hidden values and effects, noisy sensors.
+"""Trials of a policy on the synthetic robot, in plain C MuJoCo with hidden values and effects and noisy sensors.
 
-The loop that closes it is the one that goes to a real robot, `control.Controller`.
-
-It stands for the paper's robot in Table II, and is called a synthetic robot wherever its figures are shown.
+The control loop is the one of a real robot, `control.Controller`.  The synthetic robot replaces the real one of the
+paper's Table II, and reports call it a synthetic robot.
 """
 
 from __future__ import annotations
@@ -24,20 +23,24 @@ from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.policy.control import Controller, Policy, Reading
 from droid_jax.policy.trials import BLOWN_UP, Trials
-from droid_jax.synthetic.hidden_effects import LONGEST_STEP, Applied, at_work, check
-from droid_jax.synthetic.hooks import Influence, edited, under
-from droid_jax.synthetic.robot import own_engine
+from droid_jax.synthetic.hidden_effects import LONGEST_STEP, Applied, check, influences_of
+from droid_jax.synthetic.hooks import Influence, edited, start_simulation
+from droid_jax.synthetic.robot import set_engine
 
-TRIAL = 4  # a stream of its own: those of the hidden errors are [seed, 1] to [seed, 3]
+TRIAL = 4  # random stream of trials; the synthetic robot's recordings use [seed, 1] to [seed, 3]
 
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """How the synthetic robot differs from what the policy was trained on, beside its hidden values.
+    """Trials, time step and sensor noise of the synthetic robot.
 
-    trials.  timestep: s, of the Euler integrator; hidden effects shorten it where they must.
-    position_noise, velocity_noise: rad, rad/s of the joints' sensors; knob_noise: m, of the camera's sight of the
-    knob, drawn once for each trial and axis.  seed.
+    Attributes:
+        trials: number of trials.
+        timestep: s, of the Euler integrator; at most LONGEST_STEP with hidden effects.
+        position_noise: rad, standard deviation of the joint position sensors.
+        velocity_noise: rad/s, of the joint velocity sensors.
+        knob_noise: m, of the knob's position by the camera, drawn once for each trial and axis.
+        seed: of all randomness.
     """
 
     trials: int = 100
@@ -61,8 +64,12 @@ class TransferConfig:
 class PolicyRobot:
     """The synthetic robot before a trial; `synthetic_robot` makes it.
 
-    scene: with the hidden values, at the robot's own time step, integrator and solver effort.  start: [nq].
-    hidden: effects, as of the blind suite.
+    Attributes:
+        scene: with the hidden values, and the robot's time step, integrator and solver settings.
+        start: [nq] mean start pose.
+        hidden: effects.
+        task: of the policy.
+        config: noise and number of trials.
     """
 
     scene: Scene
@@ -80,12 +87,22 @@ def synthetic_robot(
     task: Task | None = None,
     config: TransferConfig | None = None,
 ) -> PolicyRobot:
-    """A robot with hidden values and effects.
+    """A synthetic robot with hidden values and effects, for trials of a policy.
 
-    start: [nq] as in training (`DoorEnv.start`), off by `Task.spread` in every trial.  truth: hidden values, of the
-    door space and its nuisances; what it leaves out is at its prior's mean.
-    Raises ValueError for unknown effects and amplitudes, and for hidden effects that act on commands or sensors as
-    whole traces: in a closed loop there are none yet.
+    Args:
+        scene: the door.
+        start: [nq] mean start pose, as in training (`DoorEnv.start`); `Task.spread` varies it in each trial.
+        truth: hidden values of the door's space and its nuisances; others are at the prior's mean.
+        hidden: effects.
+        task: of the policy.
+        config: noise and number of trials.
+
+    Returns:
+        The robot.
+
+    Raises:
+        ValueError: an effect or amplitude is invalid, or an effect acts on whole traces of commands or sensors, which
+            a closed loop does not support.
     """
     task, config = task or Task(), config or TransferConfig()
     check_playable(scene, hidden)
@@ -94,61 +111,61 @@ def synthetic_robot(
     substeps_of(task.control, config.timestep, "the synthetic robot's")
     space = door_space(scene) + door_nuisances(scene)
     model = make_c_model(scene, space, space.values(dict(truth)))
-    own = replace(scene, model=own_engine(model, config.timestep))
-    return PolicyRobot(own, start, tuple(hidden), task, config)
+    return PolicyRobot(replace(scene, model=set_engine(model, config.timestep)), start, tuple(hidden), task, config)
 
 
 def check_playable(scene: Scene, hidden: Sequence[Applied]) -> None:
-    """ValueError for hidden effects that a policy cannot be tried with."""
+    """Raise ValueError for hidden effects that are invalid or that a closed loop does not support."""
     for one in hidden:
         check(one, scene)
-    unfit = [a.name for a in hidden if _acts_on_traces(scene, a)]
-    if unfit:
+    unsupported = [a.name for a in hidden if _acts_on_traces(scene, a)]
+    if unsupported:
         raise ValueError(
-            f"hidden effects {', '.join(unfit)} change whole traces, which a closed loop does not have yet: "
+            f"hidden effects {', '.join(unsupported)} change whole traces, which trials of a policy do not support: "
             "choose others, or none"
         )
 
 
 def transfer(policy: Policy, robot: PolicyRobot, progress: Callable[[int], None] = lambda done: None) -> Trials:
-    """Trials of a policy on the synthetic robot.  ValueError for a policy that acts at another rate than the task's.
+    """Outcomes of all trials of a policy on the synthetic robot.
 
-    progress: is told how many trials are over.
+    progress: is called with the number of finished trials.
+    Raises ValueError for a policy that acts at another rate than the task.
     """
     _check_rate(policy, robot.task)
-    done = []
+    outcomes = []
     with ThreadPoolExecutor(runtime.cores()) as pool:
-        for trial in pool.map(lambda number: _trial(policy, robot, number), range(robot.config.trials)):
-            done.append(trial)
-            progress(len(done))
-    return Trials(*(np.array(column) for column in zip(*done, strict=True)))
+        for outcome in pool.map(lambda number: _trial(policy, robot, number), range(robot.config.trials)):
+            outcomes.append(outcome)
+            progress(len(outcomes))
+    return Trials(*(np.array(column) for column in zip(*outcomes, strict=True)))
 
 
 def filmed(policy: Policy, robot: PolicyRobot, number: int) -> np.ndarray:
-    """[K, nq] the states of one of `transfer`'s trials, before each action and at the end."""
+    """[K, nq] positions in trial `number` of `transfer`, before each action and at the end."""
     states: list[np.ndarray] = []
     watched(policy, robot, number, lambda data: states.append(data.qpos.copy()))
     return np.array(states)
 
 
 def watched(policy: Policy, robot: PolicyRobot, number: int, watch: Callable[[mujoco.MjData], None]) -> None:
-    """One of `transfer`'s trials again; watch: sees the simulation before each action and at the end."""
+    """Repeat trial `number` of `transfer`; `watch` is called before each action and at the end."""
     _check_rate(policy, robot.task)
     _trial(policy, robot, number, watch)
 
 
 def _check_rate(policy: Policy, task: Task) -> None:
     if abs(policy.interface.period - task.control) > 1e-9:
-        raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task asks every {task.control:g} s")
+        raise ValueError(f"the policy acts every {policy.interface.period:g} s, the task every {task.control:g} s")
 
 
 def _trial(
     policy: Policy, robot: PolicyRobot, number: int, watch: Callable[[mujoco.MjData], None] = lambda data: None
 ) -> tuple[bool, float, int, float, str]:
-    """Success, largest angle, actions, share of them with the grip on, why the loop stopped."""
+    """Success, largest angle [rad], number of actions until success, share of actions with a grip, reason of a stop."""
     scene, task, config = robot.scene, robot.task, robot.config
     rng = np.random.default_rng([config.seed, number, TRIAL])
-    influences = at_work(scene, robot.hidden)
+    influences = influences_of(scene, robot.hidden)
     model, hand = edited(scene.model, influences), hand_of(scene)
     data = mujoco.MjData(model)
     data.qpos[:] = robot.start
@@ -158,40 +175,40 @@ def _trial(
     sense = _senses(scene, data, config, rng)
     seen = looked(hand, data, finger_forces_c(hand, model, data), np.zeros((2, 3)), task.control, np)
     loop = Controller(policy)
-    held = longest = angle = 0.0
-    grips = made = steps = 0
+    open_time = longest = angle = 0.0
+    grips = actions = steps = 0
     stopped = ""
     watch(data)
-    while made < task.steps:
-        asked = loop.act(sense(made * task.control))
-        if asked.stopped is not None:
-            stopped = asked.stopped
+    while actions < task.steps:
+        command = loop.act(sense(actions * task.control))
+        if command.stopped is not None:
+            stopped = command.stopped
             break
-        advance(np.concatenate([asked.arm, asked.fingers]))
-        made += 1
-        if not np.isfinite(data.qpos).all() or data.time < (made - 0.5) * task.control:
-            stopped = BLOWN_UP  # MuJoCo starts over then: its clock is late
+        advance(np.concatenate([command.arm, command.fingers]))
+        actions += 1
+        if not np.isfinite(data.qpos).all() or data.time < (actions - 0.5) * task.control:
+            stopped = BLOWN_UP  # MuJoCo resets a simulation that diverges: its clock is late then
             break
         watch(data)
-        mujoco.mj_kinematics(model, data)  # mj_step leaves places as they were before its last step
+        mujoco.mj_kinematics(model, data)  # after mj_step, frames are those before its last step
         seen = looked(hand, data, finger_forces_c(hand, model, data), seen.pads, task.control, np)
         grips += bool(gripped(task, seen))
-        angle, held = max(angle, float(seen.angle)), float(held_open(task, seen, held))
+        angle, open_time = max(angle, float(seen.angle)), float(held_open(task, seen, open_time))
         steps += not succeeded(task, longest)
-        longest = max(longest, held)
-    return bool(succeeded(task, longest)), angle, steps, grips / max(made, 1), stopped
+        longest = max(longest, open_time)
+    return bool(succeeded(task, longest)), angle, steps, grips / max(actions, 1), stopped
 
 
 def _senses(
     scene: Scene, data: mujoco.MjData, config: TransferConfig, rng: np.random.Generator
 ) -> Callable[[float], Reading]:
-    """What the robot's sensors say at a time; the camera's error is drawn once."""
+    """A function of time [s] that gives the sensors' reading; the camera's error is drawn once."""
     joints, dofs, knob = scene.joint_qpos, scene.joint_dofs, scene.id("site", "knob")
     fingers = [scene.qpos(name) for name in scene.finger_joints]
-    sight, pose = rng.normal(0.0, config.knob_noise, 3), np.eye(4)
+    camera_error, pose = rng.normal(0.0, config.knob_noise, 3), np.eye(4)
 
     def sense(time: float) -> Reading:
-        pose[:3, :3], pose[:3, 3] = data.site_xmat[knob].reshape(3, 3), data.site_xpos[knob] - sight
+        pose[:3, :3], pose[:3, 3] = data.site_xmat[knob].reshape(3, 3), data.site_xpos[knob] - camera_error
         return Reading(
             time,
             data.qpos[joints] + rng.normal(0.0, config.position_noise, len(joints)),
@@ -207,20 +224,20 @@ def _senses(
 def _advancer(
     model: mujoco.MjModel, data: mujoco.MjData, influences: Sequence[Influence], steps: int
 ) -> Callable[[np.ndarray], None]:
-    """A function of a command [U] that takes the simulation so many steps on."""
-    _, step = under(model, data, influences)
+    """A function of a command [U] that makes so many time steps."""
+    _, step = start_simulation(model, data, influences)
 
-    def plain(ctrl: np.ndarray) -> None:
+    def without_effects(ctrl: np.ndarray) -> None:
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data, nstep=steps)  # all in C
 
-    def influenced(ctrl: np.ndarray) -> None:
+    def with_effects(ctrl: np.ndarray) -> None:
         for _ in range(steps):
             step(ctrl)
 
-    return influenced if any(i.step for i in influences) else plain
+    return with_effects if any(i.step for i in influences) else without_effects
 
 
 def _acts_on_traces(scene: Scene, one: Applied) -> bool:
-    (found,) = at_work(scene, [one])
-    return found.command is not None or found.sense is not None
+    (influence,) = influences_of(scene, [one])
+    return influence.command is not None or influence.sense is not None

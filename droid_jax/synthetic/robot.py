@@ -1,9 +1,8 @@
 """The synthetic robot: plain C MuJoCo with hidden physics, in place of a real Panda and a real door.
 
-It runs at another time step and integrator than the analysis, with values the analysis does not
-know, small errors from repeat to repeat, and sensor noise at the levels of a real Panda.  Its
-torque is the motor's, as the simulated servo's damping (Table I) cannot be seen on the link side;
-`SyntheticRobotConfig.side` asks for the link side.
+Its time step and integrator differ from those of the analysis, and its parameter values are hidden.  Repeats differ by
+small errors, and sensors have the noise of a real Panda.  Its torques are motor-side by default, since a link-side
+torque does not contain the simulated servo's damping (Table I).
 """
 
 from __future__ import annotations
@@ -35,20 +34,23 @@ from droid_jax.simulate.c_engine import Trace, instrument, simulate
 
 @dataclass(frozen=True)
 class SyntheticRobotConfig:
-    """How the synthetic robot moves and measures.
+    """Repeats, integration and sensors of the synthetic robot.  Noise is given by standard deviations.
 
-    repeats: N.
-    timestep: s; C MuJoCo's semi-implicit Euler, first order, so fine enough to stand for continuous time
-      (the analysis takes steps twenty or forty times as long, second order).  At 0.25 ms a door's recordings hold
-      U of about 0.001 that no parameter takes away: something seems to be missing where nothing is.
-    rate: Hz of torque and position samples.
-    torque_noise: N m, white, joints 1-4 and 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
-    torque_drift: N m, first-order noise with a correlation time of 0.15 s, joints 1-4 and 5-7.
-    position_noise: rad.
-    angle_noise: rad, angle_rate: Hz: a camera on the door.
-    start_noise: rad, error of the start pose in each repeat.
-    pose_noise: m, error of the door's position in each repeat.
-    side: side of the joints at which the torque is measured.
+    Attributes:
+        repeats: number of repeats N.
+        timestep: s, of C MuJoCo's semi-implicit Euler, a first-order integrator.  The default approximates continuous
+            time; the second-order steps of the analysis are 20 or 40 times as long.  At 0.25 ms a door's recordings
+            have U of about 0.001 that no parameter explains, so a search may report a missing effect.
+        rate: Hz, of torque and position samples.
+        torque_noise: N m, white, of joints 1-4 and of joints 5-7 (a real Panda: 0.03 to 0.08 at 1 kHz).
+        torque_drift: N m, first-order noise, of joints 1-4 and of joints 5-7.
+        drift_time: s, correlation time of that noise.
+        position_noise: rad, white.
+        angle_noise: rad, of a camera that measures the door's angle.
+        angle_rate: Hz, of that camera.
+        start_noise: rad, error of the start pose in each repeat.
+        pose_noise: m, error of the door's position in each repeat.
+        side: of the joints on which torques are measured.
     """
 
     repeats: int = 10
@@ -56,6 +58,7 @@ class SyntheticRobotConfig:
     rate: float = 500.0
     torque_noise: tuple[float, float] = (0.05, 0.03)
     torque_drift: tuple[float, float] = (0.03, 0.015)
+    drift_time: float = 0.15
     position_noise: float = 2e-5
     angle_noise: float = 0.0035
     angle_rate: float = 30.0
@@ -69,7 +72,7 @@ class SyntheticRobotConfig:
             self,
             **dict.fromkeys(noises, partial(number, least=0)),
             **dict.fromkeys(("torque_noise", "torque_drift"), several(partial(number, least=0), 2)),
-            **dict.fromkeys(("timestep", "rate", "angle_rate"), partial(number, above=0)),
+            **dict.fromkeys(("timestep", "rate", "angle_rate", "drift_time"), partial(number, above=0)),
             repeats=partial(whole, least=1),
             side=partial(choice, kind=TorqueSide),
         )
@@ -77,13 +80,16 @@ class SyntheticRobotConfig:
 
 @dataclass(frozen=True, eq=False)
 class SyntheticRobot:
-    """The synthetic robot before it moves, and what it shall repeat.
+    """The synthetic robot before it moves, and the motion that it will repeat.
 
-    demonstration, truth, config, seed: as given to `record`.
-    scene: instrumented, at the synthetic robot's own time step and integrator.
-    models: [N], qpos0: [N, nq], each repeat with its own small errors.
-    clock: [T] s and control: [T, U] at the synthetic robot's own time step.
-    rng: what is left of the recording's randomness, for the sensors.
+    Attributes:
+        demonstration, truth, config, seed: arguments of `record`.
+        scene: instrumented, with the synthetic robot's time step and integrator.
+        models: [N] models of the repeats, with their errors.
+        qpos0: [N, nq] start poses of the repeats, with their errors.
+        clock: [T] s, at the synthetic robot's time step.
+        control: [T, U] commands on that clock.
+        rng: random generator for the sensors.
     """
 
     demonstration: Recording
@@ -98,12 +104,11 @@ class SyntheticRobot:
     rng: np.random.Generator
 
 
-DRIFT_TIME = 0.15  # s
-_WRIST = 4  # joints from here on have the smaller noise
+_WRIST = 4  # index of the first joint with the smaller noise
 
 
 def draw_nuisances(scene: Scene, seed: int) -> dict[str, float]:
-    """One draw from the nuisances' priors: the same robot and door for all recordings made with it."""
+    """One draw from the nuisances' priors, by name: the set-up of a robot and a door."""
     space = door_nuisances(scene)
     draw = np.random.default_rng([seed, 1]).normal(space.mean, space.std)
     return dict(zip(space.names, np.clip(draw, space.low, space.high).tolist(), strict=True))
@@ -120,10 +125,19 @@ def record(
 ) -> Recording:
     """Repeat a demonstration N times on the synthetic robot and record it.
 
-    truth: hidden values by parameter name, of the door space and of its nuisances; what it does
-      not name has the scene's own value.
-    Raises ValueError for unknown names, and where a repeat blows up or loses the door (a
-    demonstration is safe by definition: choose another truth).
+    Args:
+        scene: what moves.
+        demonstration: whose commands are repeated.
+        truth: hidden values by parameter name, of the door's space and its nuisances; others have the scene's values.
+        seed: of all randomness.
+        config: of the robot.
+        name: of the recording; None: the demonstration's.
+
+    Returns:
+        The recording.
+
+    Raises:
+        ValueError: a name is unknown, or a repeat diverges or loses the door (choose another truth then).
     """
     config = config or SyntheticRobotConfig()
     synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config)
@@ -142,7 +156,11 @@ def set_up(
     config: SyntheticRobotConfig,
     space: Space | None = None,
 ) -> SyntheticRobot:
-    """Models, start poses and commands of every repeat; `space` is what truth may speak of (default: the door's)."""
+    """Models, start poses and commands of all repeats.
+
+    The arguments are those of `record`.  space: the parameters that truth may name; None: those of a held door, else
+    torque offsets and the time offset.
+    """
     if config.repeats < 1:
         raise ValueError(f"the synthetic robot needs at least one repeat, got {config.repeats}")
     if not 0 < config.rate * config.timestep <= 1:
@@ -163,7 +181,7 @@ def set_up(
 def as_recording(
     synthetic_robot: SyntheticRobot, trace: Trace, torque: np.ndarray, position: np.ndarray, *, name: str | None = None
 ) -> Recording:
-    """What the sensors make of a trace: torque and position [N, T, J] with offset and noise at the sensors' rates."""
+    """The recording of a trace: torque and position [N, T, J] with offsets and noise, at the sensors' rates."""
     demonstration, config = synthetic_robot.demonstration, synthetic_robot.config
     scene, clock, rng = synthetic_robot.scene, synthetic_robot.clock, synthetic_robot.rng
     _check_opened(demonstration, clock, trace)
@@ -200,22 +218,24 @@ def as_recording(
 
 
 def _carries_weight(scene: Scene) -> bool:
-    """Whether the measured torques contain the arm's weight: where no body of a measured joint is compensated,
-    or where the joints' own motors do it (actuatorgravcomp)."""
+    """Whether the measured torques contain gravity.
+
+    They do if no body of a measured joint is compensated, or if the joints' actuators do it (actuatorgravcomp).
+    """
     model = scene.model
     joints = [scene.id("joint", j) for j in scene.joints]
-    elsewhere = (model.body_gravcomp[model.jnt_bodyid[joints]] != 0) & (model.jnt_actgravcomp[joints] == 0)
-    return bool(model.opt.gravity.any()) and not elsewhere.any()
+    excluded = (model.body_gravcomp[model.jnt_bodyid[joints]] != 0) & (model.jnt_actgravcomp[joints] == 0)
+    return bool(model.opt.gravity.any()) and not excluded.any()
 
 
 def _hidden_scene(scene: Scene, config: SyntheticRobotConfig) -> Scene:
-    """The scene instrumented, at the synthetic robot's own time step, integrator and solver effort."""
-    hidden = replace(scene, model=own_engine(copy.copy(scene.model), config.timestep))
+    """The scene with sensors, and with the synthetic robot's time step, integrator and solver settings."""
+    hidden = replace(scene, model=set_engine(copy.copy(scene.model), config.timestep))
     return replace(hidden, model=instrument(hidden))
 
 
-def own_engine(model: mujoco.MjModel, timestep: float) -> mujoco.MjModel:
-    """The model with the synthetic robot's own time step, integrator and solver effort set."""
+def set_engine(model: mujoco.MjModel, timestep: float) -> mujoco.MjModel:
+    """Set a model's time step, integrator and solver settings to the synthetic robot's, and return it."""
     model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
     model.opt.iterations, model.opt.ls_iterations = 100, 50
     return model
@@ -229,7 +249,7 @@ def _repeats(
     rng: np.random.Generator,
     space: Space | None,
 ) -> tuple[list[mujoco.MjModel], np.ndarray]:
-    """Models [N] and start poses [N, nq], each with its own small errors."""
+    """Models [N] and start poses [N, nq] of the repeats, with their errors."""
     space = _space(hidden, truth, space)
     axes = [axis for axis in ("door_x", "door_y") if axis in space.names]
     models, poses = [], []
@@ -245,32 +265,32 @@ def _repeats(
 
 
 def _space(hidden: Scene, truth: Mapping[str, float], space: Space | None) -> Space:
-    """Every parameter the synthetic robot can have, around the scene's own values.
+    """The parameters that truth may name, with the scene's values as means.
 
-    Without a space: Table I and the nuisances for a door that is held, sensor offsets and timing otherwise.
+    Without a space: those of Table I and the nuisances of a door that is held, else torque offsets and the time offset.
     """
     if space is None and hidden.object_joint == HINGE and hidden.grip:
         space = door_space(hidden) + door_nuisances(hidden)
     elif space is None:
         space = Space((time_offset(), *torque_offsets(hidden.joints)))
-    own = {p.name: (_own_value(hidden, p), p.std) for p in space.parameters if p.writes and not p.nuisance}
+    means = {p.name: (_value_in_scene(hidden, p), p.std) for p in space.parameters if p.writes and not p.nuisance}
     for name in truth:
-        space.index(name)
-    return space.with_prior(**own)
+        space.index(name)  # raises for an unknown name
+    return space.with_prior(**means)
 
 
-def _own_value(scene: Scene, parameter: Parameter) -> float:
-    """The parameter's value in the scene as it is."""
+def _value_in_scene(scene: Scene, parameter: Parameter) -> float:
+    """The parameter's value in the unchanged scene."""
     first = parameter.writes[0]
     return float(first.neutral(nominal_field(scene.model, first.field)[first.index]))
 
 
 def _control(hidden: Scene, demonstration: Recording, timestep: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Clock [T] and commands [T, U] of the synthetic robot's own time step."""
+    """Clock [T] s and commands [T, U] at the synthetic robot's time step, delayed by `delay` s."""
     columns = hidden.command_index(demonstration.command_names)
-    if without := [n for n, c in zip(hidden.command_names, columns, strict=True) if c < 0]:
+    if missing := [n for n, c in zip(hidden.command_names, columns, strict=True) if c < 0]:
         raise ValueError(
-            f"the synthetic robot needs a command for {', '.join(without)} too; the demonstration has none"
+            f"the synthetic robot needs a command for {', '.join(missing)} too; the demonstration has none"
         )
     start, end = demonstration.time[0], demonstration.time[-1]
     clock = start + np.arange(int((end - start) / timestep + 1e-6) + 1) * timestep
@@ -290,17 +310,19 @@ def _check_opened(demonstration: Recording, clock: np.ndarray, trace: Trace) -> 
 
 
 def _check_link_side(scene: Scene, models: Sequence[mujoco.MjModel]) -> None:
-    """ValueError where the model's own dry friction stands between motor and link: no sensor of C MuJoCo tells it."""
+    """Raise ValueError for joints with dry friction, whose link-side torque no sensor of C MuJoCo measures."""
     friction = np.max([m.dof_frictionloss[scene.joint_dofs] for m in models], axis=0)
-    if rubs := [joint for joint, loss in zip(scene.joints, friction, strict=True) if loss > 1.001 * TINY_FRICTIONLOSS]:
+    limit = 1.001 * TINY_FRICTIONLOSS
+    if affected := [joint for joint, loss in zip(scene.joints, friction, strict=True) if loss > limit]:
         raise ValueError(
-            f"the synthetic robot cannot tell the torque on the link side of joints with a frictionloss of their own "
-            f"({', '.join(rubs)}): take it out of the scene and hide joint_stribeck instead, or measure at the motor"
+            f"the synthetic robot cannot measure link-side torques of joints with a frictionloss "
+            f"({', '.join(affected)}): remove it from the scene and hide 'dry_friction' or 'stribeck_friction', or "
+            "measure at the motor"
         )
 
 
 def sensor_torque(synthetic_robot: SyntheticRobot, trace: Trace) -> np.ndarray:
-    """[N, T, J] N m at the motor, or at the link: without rotor inertia and joint damping."""
+    """[N, T, J] N m, torques on the side of the configuration; link-side ones exclude armature and joint damping."""
     if synthetic_robot.config.side is TorqueSide.MOTOR:
         return trace.torque
     dofs = synthetic_robot.scene.joint_dofs
@@ -311,26 +333,26 @@ def sensor_torque(synthetic_robot: SyntheticRobot, trace: Trace) -> np.ndarray:
 
 
 def _offset(scene: Scene, truth: Mapping[str, float]) -> np.ndarray:
-    """[J] N m constant sensor errors."""
+    """[J] N m, constant sensor errors."""
     return np.array([truth.get(f"torque_offset[{j}]", 0.0) for j in scene.joints])
 
 
 def _torque_noise(shape: tuple[int, ...], config: SyntheticRobotConfig, rng: np.random.Generator) -> np.ndarray:
-    """White noise and slow first-order noise, [N, T, J] N m."""
+    """[N, T, J] N m, white noise plus slow first-order noise."""
     wrist = np.arange(shape[-1]) >= _WRIST
     white = np.where(wrist, config.torque_noise[1], config.torque_noise[0])
     slow = np.where(wrist, config.torque_drift[1], config.torque_drift[0])
-    keep = np.exp(-1.0 / (config.rate * DRIFT_TIME))
-    innovation = rng.normal(size=shape) * np.sqrt(1 - keep**2)
+    decay = np.exp(-1.0 / (config.rate * config.drift_time))
+    innovation = rng.normal(size=shape) * np.sqrt(1 - decay**2)
     innovation[:, 0] = rng.normal(size=(shape[0], shape[2]))
-    drift = scipy.signal.lfilter([1.0], [1.0, -keep], innovation, axis=1)
+    drift = scipy.signal.lfilter([1.0], [1.0, -decay], innovation, axis=1)
     return white * rng.normal(size=shape) + slow * drift
 
 
 def _camera(
     scene: Scene, clock: np.ndarray, angle: np.ndarray, config: SyntheticRobotConfig, rng: np.random.Generator
 ) -> Channel:
-    """The door's angle on the camera's own clock, [N, Tc, 1] rad (m of a slide)."""
+    """The channel of the door's angle on the camera's clock, [N, Tc, 1] rad (m for a slide)."""
     joint = str(scene.object_joint)
     time = np.arange(clock[0], clock[-1], 1.0 / config.angle_rate)
     values = np.stack([np.interp(time, clock, row) for row in angle])[..., None]
@@ -348,13 +370,22 @@ def _channel(name: str, unit: str, columns: tuple[str, ...], time: np.ndarray, v
 
 
 def is_synthetic(recording: Recording) -> bool:
-    """Whether the synthetic robot made a recording, whichever file it has been through since."""
+    """Whether the synthetic robot made a recording, also after it was written to a file and read."""
     return recording.meta.get("source") == SOURCE
 
 
 def synthetic_truth(scene: Scene, springs: int, seed: int, *, nuisances: bool = True) -> dict[str, float]:
-    """Hidden values of a synthetic robot and door: a fitted column of Table I, joint dampings up to
-    some 15 % off the scene's, and (optionally) one draw of the nuisances."""
+    """Hidden values of a synthetic robot and door.
+
+    Args:
+        scene: the door.
+        springs: number of springs, which chooses a fitted column of Table I.
+        seed: of the draws.
+        nuisances: whether to draw the nuisances too.
+
+    Returns:
+        The column's values, joint dampings with a standard deviation of 7 % around the scene's, and the nuisances.
+    """
     rng = np.random.default_rng([seed, 3])
     space = door_space(scene)
     damping = {n: float(space[n].mean * np.exp(rng.normal(0, 0.07))) for n in JOINT_DAMPING}

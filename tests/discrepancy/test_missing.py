@@ -111,7 +111,7 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
     same = Effect(
         "same", (replace(space.parameters[0], name="payload_mass[elbow]", writes=()),), locations={"elbow": ()}
     )
-    with pytest.raises(ValueError, match=r"'payload_mass\[elbow\]' \(of the effect same\); give yours others"):
+    with pytest.raises(ValueError, match=r"'payload_mass\[elbow\]' \(of the effect same\); rename them"):
         joined(taken, (same,))
     assert joined(space, (same,)).names == (*space.names, "payload_mass[elbow]")
 
@@ -125,7 +125,7 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
         ({"recordings": [elbow_log(0.0, 2.0, 8)] * 2}, "the train and the validation recording are the same"),
         ({"effects": ()}, "effects: there is none to test"),
         ({"effects": [Effect("late")]}, "none of the effects states its locations"),
-        ({"effects": [LATE]}, "no commands that an effect could change: late"),
+        ({"effects": [LATE]}, "effects late change commands, which a prescribed motion"),
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],
 )

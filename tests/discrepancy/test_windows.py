@@ -34,7 +34,7 @@ from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, load_scene, with_options
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate.windows import WindowConfig, _spread, held, joint_states, why_whole
+from droid_jax.simulate.windows import WindowConfig, _spread, fully_servoed, joint_states, why_no_windows
 
 SHORT = WindowConfig(length=0.4, lead=0.1, history=0.05)
 NOISE = 1e-4
@@ -88,16 +88,16 @@ def test_a_state_that_was_not_measured_is_none():
 
 def test_motions_are_replayed_whole_where_a_servo_holds_every_joint():
     free = load_scene(Path(__file__).resolve().parents[2] / "experiments" / "xl330.xml")
-    assert held(scene()) and held(free)
+    assert fully_servoed(scene()) and fully_servoed(free)
     model = copy.copy(free.model)
     model.actuator_biasprm[:, 1] = 0.0  # a motor's torque, which follows no position
-    assert not held(replace(free, model=model))
+    assert not fully_servoed(replace(free, model=model))
 
 
 def test_windows_need_every_joint():
     recording = swung("a", 1.0, 1.0)
-    assert why_whole(scene(), recording) == ""
-    assert "no position of swing was measured" in why_whole(scene(), swung("a", 1.0, 1.0, ("torque",)))
+    assert why_no_windows(scene(), recording) == ""
+    assert "no position of swing was measured" in why_no_windows(scene(), swung("a", 1.0, 1.0, ("torque",)))
 
 
 def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases():

@@ -278,7 +278,7 @@ GEARED = {"gear_motor[elbow]": 0.2, "gear_links[elbow]": 0.1, "gear_at_rest[elbo
     ("name", "values", "why"),
     [
         ("velocity_feedforward", {"velocity_feedforward[elbow]": 0.02}, "more to the command than to delay it"),
-        ("gear_friction", GEARED, "what motor and links put onto the gear"),
+        ("gear_friction", GEARED, "the torques of motor and links on the gear"),
     ],
 )
 def test_the_reason_why_a_law_has_no_table_is_stated(made: Made, name: str, values: dict[str, float], why: str):

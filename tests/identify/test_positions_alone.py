@@ -240,12 +240,12 @@ def test_torques_without_the_links_weight_are_left_out_of_an_evaluation(logs: Si
     light = replace(both, torque=replace(both.torque, gravity=False))
     of = {"before": space.mean, "after": space.mean, "engine": "mujoco"}
     (whole,) = evaluate_on(scene, space, both, **of)
-    with pytest.warns(UserWarning, match="torques are left out of the errors: .* holds no weight"):
+    with pytest.warns(UserWarning, match="torques are left out of the errors: .* excludes gravity"):
         (found,) = evaluate_on(scene, space, light, **of)
     assert set(whole.errors) == {"torque", "position"} and set(found.errors) == {"position"}
     assert found.errors["position"] == whole.errors["position"] and found.recording.sha256 == light.sha256
     alone = replace(light, channels={"torque": light.channels["torque"]})
-    with pytest.raises(ValueError, match="says that its torque holds no weight"):
+    with pytest.raises(ValueError, match="says that its torque excludes gravity"):
         evaluate_on(scene, space, alone, **of)
 
 

@@ -1,4 +1,4 @@
-"""A servo's DC motor: its numbers as parameters, against the equation of the motor alone."""
+"""Parameters of a servo's DC motor, against the differential equation of a motor."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def by_motor(constant: float, resistance: float, goal: np.ndarray, substeps: int
     return np.array(out)
 
 
-def test_a_replay_is_the_motor_of_other_constants():
-    """Through saturation to the no-load speed, and back: a slow sine larger than what the voltage follows."""
+def test_a_replay_is_that_of_a_motor_with_other_constants():
+    """Through saturation to the no-load speed and back: a slow sine that the motor cannot follow."""
     scene = scene_of(mjcf(CONSTANT, RESISTANCE))
     space = space_of(scene, "torque_constant", "resistance")
     goal = 6.0 * np.sin(8.0 * np.arange(900) * 1e-3)
@@ -78,7 +78,7 @@ def test_a_replay_is_the_motor_of_other_constants():
         (("stall_torque", "no_load_speed"), (1.5, 0.8), 1 / 0.8, 1 / 0.8 / 1.5),  # T = K V / R, W = V / K
     ],
 )
-def test_either_pair_of_numbers_is_an_mjcf_with_them(terms, values, constant: float, resistance: float):
+def test_either_pair_of_terms_equals_an_mjcf(terms, values, constant: float, resistance: float):
     scene = scene_of(mjcf(CONSTANT, RESISTANCE))
     got = make_c_model(scene, space_of(scene, *terms), np.array(values))
     expected = mujoco.MjModel.from_xml_string(mjcf(constant * CONSTANT, resistance * RESISTANCE))

@@ -1,4 +1,4 @@
-"""An encoder's zero as a parameter: the same robot in other readings, in the model, in C and in the MJCF."""
+"""An encoder offset as a parameter: the same robot with other readings, in the model, in C and in the MJCF."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def forces(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     return np.array([data.qfrc_bias, data.qfrc_passive, data.qfrc_constraint])
 
 
-def test_encoders_are_right_in_a_model_that_a_program_returned():
-    """It has arrays of its own: environments with randomised physics computed errors of zero in every step."""
+def test_offsets_are_found_in_a_model_that_a_program_returned():
+    """Its arrays are copies, as in environments with randomised physics."""
     scene = scene_of()
     model = jax.jit(lambda masses: scene.mjx.replace(body_mass=2 * masses))(scene.mjx.body_mass)
     assert model.qpos0 is not scene.mjx.qpos0 and encoder_error(scene, model) is None
@@ -75,7 +75,7 @@ def test_the_robot_is_the_same_at_readings_lower_by_the_offset(reading: float):
     assert unwritten(scene, space) == ()
 
 
-def test_a_file_asks_for_it_by_the_sensor(tmp_path: Path):
+def test_a_file_states_it_as_a_sensors_term(tmp_path: Path):
     scene = scene_of()
     entry = {"sensor": "encoder_offset", "element": "elbow", "std": 0.02, "high": 0.1}
     p = loaded(tmp_path, scene, entry)["encoder_offset[elbow]"]
@@ -92,8 +92,8 @@ def test_a_file_asks_for_it_by_the_sensor(tmp_path: Path):
             loaded(tmp_path, scene, {**entry, **change})
 
 
-def test_c_compensates_by_the_joint_and_says_so():
-    """The C engine replays encoders' zeros where nothing is compensated."""
+def test_c_refuses_offsets_with_gravity_compensation():
+    """Without compensation the C engine replays encoder offsets."""
     scene, clock = scene_of("1"), np.arange(0, 0.4, 0.002)
     size = (1, len(clock), 2)
     torque = Channel(
@@ -105,5 +105,7 @@ def test_c_compensates_by_the_joint_and_says_so():
         "still", clock, np.zeros((len(clock), 2)), scene.joints, {"torque": torque}, convention, start
     )
     space = Space((joint_encoder_offset(scene, "elbow", std=0.02, high=0.1),))
-    with pytest.raises(ValueError, match="compensates gravity where joints are, not where encoders say; use MJX"):
+    with pytest.raises(
+        ValueError, match="compensates gravity at the true joint positions, not at those that encoders read; use MJX"
+    ):
         make_cost(scene, space, [recording], engine="mujoco").distances(space.mean[None])

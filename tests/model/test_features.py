@@ -1,4 +1,4 @@
-"""What a scene may use: what MJX leaves out is refused by name, and all that it keeps does what it does in C."""
+"""Features of a scene: those that MJX ignores are refused by name, and supported ones agree with C."""
 
 from __future__ import annotations
 
@@ -40,34 +40,34 @@ def arm(**filled: str) -> mujoco.MjSpec:
     [
         (
             dict(extension='<plugin plugin="mujoco.elasticity.cable"/>', body=CABLE),
-            "accepts and then ignores: the plugin mujoco.elasticity.cable",
+            "accepts but ignores: the plugin mujoco.elasticity.cable",
         ),
         (
             dict(extension=PID, actuator='<plugin joint="shoulder" plugin="mujoco.pid" instance="loop"/>'),
-            "accepts and then ignores: the plugin mujoco.pid",
+            "accepts but ignores: the plugin mujoco.pid",
         ),
         (
             dict(actuator='<dcmotor name="m" joint="shoulder" motorconst="0.5" resistance="1.2"/>'),
-            r"actuator 'm' of scene 'arm' is a <dcmotor>.*gear K/R does on a joint with K\^2/R more damping",
+            r"actuator 'm' of scene 'arm' is a <dcmotor>.*gear K/R on a joint with K\^2/R more damping",
         ),
         (
             dict(actuator='<pid name="p" joint="shoulder" kp="80" kv="4"/>'),
-            "actuator 'p' of scene 'arm' is a <pid>.*what <position> with its kp and kv",
+            "actuator 'p' of scene 'arm' is a <pid>.*equivalent to <position> with its kp and kv",
         ),
         (dict(actuator='<pid joint="shoulder" kp="80" kv="4" ki="1"/>'), "actuator 0 of scene 'arm' is a <pid>"),
         (dict(actuator='<adhesion name="pad" body="upper" ctrlrange="0 1"/>'), "actuator 'pad'.*is a <adhesion>"),
         (dict(actuator='<general name="own" joint="shoulder" gaintype="user"/>'), "'own'.*with a callback"),
         (dict(flag='sleep="enable"'), "sleeping of bodies"),
-        (dict(flag='energy="enable"'), "MJX has not: the flag energy"),
-        (dict(option='solver="PGS"'), r"MJX has not: the solver PGS \(set <option solver=\"Newton\">\)"),
-        (dict(option='cone="elliptic" impratio="10"'), "pyramidal friction cones.* up to 29 % less.*impratio"),
+        (dict(flag='energy="enable"'), "MJX does not support: the flag energy"),
+        (dict(option='solver="PGS"'), r"MJX does not support: the solver PGS \(set <option solver=\"Newton\">\)"),
+        (dict(option='cone="elliptic" impratio="10"'), "pyramidal friction cones.* up to 29 % smaller.*impratio"),
         (dict(option='density="1.2"', geom='fluidshape="ellipsoid"'), "fluid model of ellipsoids"),
         (dict(option='density="1.2"'), "no air or water"),
         (dict(joint='range="-9 9" limited="true" margin="0.2"'), "two limits that act at once \\(shoulder:"),
         (dict(more='<deformable/><equality><connect body1="upper" anchor="0 0 1"/></equality>'), None),
     ],
 )
-def test_what_no_replay_has_is_refused_by_name_when_a_scene_is_loaded(filled: dict, says: str | None):
+def test_unsupported_features_are_refused_at_loading(filled: dict, says: str | None):
     if says is None:
         assert compile_scene(arm(**filled), "arm").model.neq == 1
         return
@@ -76,7 +76,7 @@ def test_what_no_replay_has_is_refused_by_name_when_a_scene_is_loaded(filled: di
 
 
 @pytest.mark.parametrize("integrator", ["RK4", "implicit"])
-def test_integrators_that_no_replay_has_are_refused_when_a_scene_is_loaded(integrator: str, tmp_path: Path):
+def test_unsupported_integrators_are_refused_at_loading(integrator: str, tmp_path: Path):
     file = tmp_path / "arm.xml"
     file.write_text(ARM.format(**dict.fromkeys(SLOTS, "")).replace("implicitfast", integrator).replace("<flag />", ""))
     with pytest.raises(ValueError, match=r"arm.xml: .*integrates with Euler or implicitfast"):
@@ -86,7 +86,7 @@ def test_integrators_that_no_replay_has_are_refused_when_a_scene_is_loaded(integ
     )
 
 
-def test_cones_pass_where_the_replays_have_them():
+def test_elliptic_cones_are_allowed_where_supported():
     for engine, mj_step in (("mujoco", False), ("mjx", True)):
         scene = compile_scene(arm(option='cone="elliptic"'), "arm", engine=engine, mj_step=mj_step)
         assert scene.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -109,7 +109,7 @@ def test_a_callback_of_the_process_is_refused():
 
 
 def test_every_number_of_a_model_that_mjx_does_not_take_is_known():
-    """A version of MuJoCo with a new one fails here: is it refused, or does it change nothing?"""
+    """A new field of another MuJoCo version fails here: it must be refused, or have no effect."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     taken = {f.name for kind in (types.Model, types.ModelJAX) for f in types.Model.fields() + kind.fields()}
     here = {
@@ -209,7 +209,7 @@ QUICK = ("joints and equalities",)
 
 
 @pytest.mark.parametrize("kept", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEPT])
-def test_what_is_kept_does_in_a_step_what_it_does_in_c(kept: str):
+def test_supported_features_give_the_same_step_as_c(kept: str):
     slots = {**dict.fromkeys(("option", "floor", "world", "a", "b", "fore", "ball", "more"), ""), "thing": FREE_SPHERE}
     model = mujoco.MjModel.from_xml_string(WORLD.format(**{**slots, **KEPT[kept]}))
     refuse_ignored(model, kept)

@@ -40,7 +40,7 @@ def scene(limits: str = "", servo: str = "") -> Scene:
 
 
 def test_the_example_of_the_modules_docstring_runs():
-    """As a reader would type it, in a scene that has what it names."""
+    """In a scene with the named elements."""
     spec = mujoco.MjSpec.from_string(
         """<mujoco><worldbody><geom name="knob" size=".1" pos="1 0 0"/>
         <body name="forearm"><joint name="elbow" axis="0 1 0"/><geom name="pad" size=".05" pos="0 0 .3" mass="1"/>
@@ -52,7 +52,7 @@ def test_the_example_of_the_modules_docstring_runs():
 
 
 def test_a_balls_number_is_one_for_all_its_degrees_of_freedom():
-    """As MJCF states it, so that what is fitted can be written."""
+    """As in MJCF, so that a fitted value can be written."""
     arm = scene()
     damping = joint_damping(arm, "wrist", std=0.5, high=5.0)
     dry = joint_frictionloss(arm, "wrist", std=0.5, high=5.0)
@@ -75,14 +75,14 @@ def test_a_balls_number_is_one_for_all_its_degrees_of_freedom():
         ("actuator_ctrlrange", "servo", {"servo": 'ctrlrange="-1 1"'}),
     ],
 )
-def test_a_limit_that_the_model_was_compiled_without_is_refused(field: str, element: str, limited: dict[str, str]):
-    """In the replay it would never act, and the written MJCF would switch it on."""
-    with pytest.raises(ValueError, match=f"{element!r} was compiled without the limit that {field} is of"):
+def test_an_inactive_limit_is_refused(field: str, element: str, limited: dict[str, str]):
+    """It would not act in the replay, but would be active in a written MJCF."""
+    with pytest.raises(ValueError, match=f"{element!r} was compiled without the limit {field},"):
         model_parameter(scene(), field, element, 1, unit="-", std=0.1, high=9.0)
     model_parameter(scene(**limited), field, element, 1, unit="-", std=0.1, high=9.0)
 
 
-def test_the_place_of_a_mocap_body_is_no_parameter():
+def test_the_pose_of_a_mocap_body_is_no_parameter():
     with pytest.raises(ValueError, match="'table' is a mocap body"):
         body_position(scene(), "table", 2, std=0.1, limit=0.5)
     body_position(scene(), "hand", 2, std=0.1, limit=0.5)
@@ -92,7 +92,7 @@ def test_the_place_of_a_mocap_body_is_no_parameter():
 
 
 def arm(folder: Path, *joints: str) -> Scene:
-    """Links below one another, each on a hinge with a servo without a name."""
+    """A chain of links, each on a hinge with an unnamed servo."""
     body = ""
     for joint in reversed(joints):
         body = (
@@ -122,7 +122,7 @@ def one(tmp_path: Path) -> Scene:
     return arm(tmp_path, "j")
 
 
-def test_rows_that_are_not_there(one: Scene, two: Scene) -> None:
+def test_rows_that_do_not_exist(one: Scene, two: Scene) -> None:
     space = Space((joint_damping(two, "elbow", std=0.5, high=10.0),))
     with pytest.raises(ValueError, match=r"'elbow_damping' writes dof_damping\[1\] of 'elbow', but in .j. "):
         dj.make_cost(one, space, log("j"))
@@ -147,7 +147,7 @@ def test_rows_of_another_body_and_fields_that_no_model_has(one: Scene, two: Scen
             check_space(one, Space((made,)))
 
 
-def test_a_space_out_of_a_file_is_checked_alike(one: Scene, two: Scene, tmp_path: Path) -> None:
+def test_a_space_of_a_file_is_checked_too(one: Scene, two: Scene, tmp_path: Path) -> None:
     path = tmp_path / "gaussian.json"
     prior(Space((joint_damping(two, "elbow", std=0.5, high=10.0),))).save(path)
     space = dj.load_gaussian(path).space
@@ -158,7 +158,7 @@ def test_a_space_out_of_a_file_is_checked_alike(one: Scene, two: Scene, tmp_path
         dj.randomised(one, dj.load_gaussian(path))
 
 
-def test_its_own_scene_and_one_with_more_joints_behind_are_taken(two: Scene, tmp_path: Path) -> None:
+def test_its_scene_and_one_with_further_joints_are_accepted(two: Scene, tmp_path: Path) -> None:
     longer = arm(tmp_path, "shoulder", "elbow", "wrist")
     space = Space(
         (

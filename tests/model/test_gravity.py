@@ -1,4 +1,4 @@
-"""What a field does to joints, here and a step further, against C MuJoCo."""
+"""The generalised force of a field, and its change with a displacement, against C MuJoCo."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def test_a_fields_force_is_the_sum_over_the_bodies(scene: Scene):
         np.testing.assert_allclose(force(qpos, mass), in_c(scene, qpos, mass), atol=2e-5)
 
 
-def test_a_step_further_it_is_another(scene: Scene):
-    """All joints by some hundredths at once: a thousandth of the change is of the third order."""
+def test_the_change_with_a_displacement(scene: Scene):
+    """All joints by some hundredths at once; a thousandth of the change is of third order."""
     mass = np.random.default_rng(3).uniform(0, 2, scene.model.nbody)
 
     @jax.jit
@@ -73,7 +73,7 @@ def test_a_step_further_it_is_another(scene: Scene):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_field_leans_about_an_axis(axis: int):
+def test_a_field_is_turned_about_an_axis(axis: int):
     turned, quaternion = np.zeros(3), np.zeros(4)
     mujoco.mju_axisAngle2Quat(quaternion, np.eye(3)[axis], 0.3)
     mujoco.mju_rotVecQuat(turned, FIELD, quaternion)

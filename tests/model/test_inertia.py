@@ -55,9 +55,9 @@ def moment(scene: Scene, column: int, **more: float) -> Parameter:
     return model_parameter(scene, "body_inertia", "a", column, name=f"i{column}", unit="kg m2", **numbers)
 
 
-def test_bounds_that_no_body_can_have_are_said(scene: Scene):
+def test_inconsistent_bounds_are_warned_of(scene: Scene):
     with pytest.warns(
-        UserWarning, match=r"the bounds of i0 hold moments that body 'a' of scene 'arm' cannot have \(0\.5"
+        UserWarning, match=r"the bounds of i0 allow moments that body 'a' of scene 'arm' cannot have \(0\.5"
     ):
         check_inertia(scene, Space((moment(scene, 0),)))
     narrow = Space(tuple(moment(scene, k, low=0.003, high=0.006) for k in range(3)))
@@ -66,14 +66,14 @@ def test_bounds_that_no_body_can_have_are_said(scene: Scene):
         check_inertia(scene, narrow)
 
 
-def test_means_that_no_body_can_have_are_refused(scene: Scene):
+def test_inconsistent_means_are_refused(scene: Scene):
     with pytest.raises(ValueError, match=r"the initial means of i0 give body 'a' .*0\.02, 0\.005, 0\.005 kg m2"):
         check_inertia(scene, Space((moment(scene, 0, mean=0.02),)))
 
 
-def test_a_mass_that_scales_its_inertia_is_no_matter(scene: Scene):
+def test_a_mass_that_scales_its_inertia_is_consistent(scene: Scene):
     space = Space((body_mass(scene, "a", std=0.3, high=5.0), body_mass_scale(scene, "a")))
-    assert len(free_inertias(scene, Space((body_mass_scale(scene, "a"),)))) == 0
+    assert len(free_inertias(Space((body_mass_scale(scene, "a"),)))) == 0
     assert bool(np.all(inertia_possible(scene, space, space.mean[None])))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -81,14 +81,14 @@ def test_a_mass_that_scales_its_inertia_is_no_matter(scene: Scene):
 
 
 @pytest.mark.parametrize("numbers", [np, jnp])
-def test_rows_are_judged_alike_on_host_and_device(scene: Scene, numbers):
+def test_the_check_agrees_on_host_and_device(scene: Scene, numbers):
     space = Space((moment(scene, 0), moment(scene, 1)))
     rows = np.array([[0.005, 0.005], [0.02, 0.005], [0.002, 0.002], [0.02, 0.019], [0.01, 0.005]])
     found = np.asarray(inertia_possible(scene, space, numbers.asarray(rows)))
     assert found.tolist() == [True, False, False, True, True]
 
 
-def test_draws_are_those_of_bodies(scene: Scene):
+def test_draws_are_consistent(scene: Scene):
     space = Space(tuple(moment(scene, k, low=1e-4) for k in range(3)))
     rng, gaussian = np.random.default_rng(0), prior(space)
     plain = gaussian.sample(np.random.default_rng(1), 500)
@@ -101,7 +101,7 @@ def test_draws_are_those_of_bodies(scene: Scene):
         possible_draws(scene, never, lambda n: np.full((n, 1), 0.4), 3, rounds=2)
 
 
-def test_a_logarithm_that_starts_where_nothing_is_felt_is_said(scene: Scene, tmp_path: Path):
+def test_a_logarithm_that_starts_without_effect_is_warned_of(scene: Scene, tmp_path: Path):
     entry = {"field": "dof_frictionloss", "element": "j", "std": 0.1, "low": 1e-6, "high": 2.0, "scaling": "log"}
     file = tmp_path / "p.json"
     file.write_text(json.dumps([entry]))
@@ -134,7 +134,7 @@ def both_bodies(limb: Scene) -> Space:
 
 
 def tensor(numbers: dict[str, Any]) -> np.ndarray:
-    """[3, 3] moments about the centre, in the body's frame."""
+    """[3, 3] moments about the centre of mass, in the body's frame."""
     turned = np.zeros(9)
     mujoco.mju_quat2Mat(turned, np.asarray(numbers["body_iquat"], float))
     axes = turned.reshape(3, 3)
@@ -154,7 +154,7 @@ def assert_alike(one: dict[str, Any], two: dict[str, Any], rtol: float) -> None:
 
 @given(terms=terms_strategy)
 @settings(deadline=None, max_examples=50)
-def test_every_value_is_a_body_that_can_exist(limb: Scene, terms: np.ndarray):
+def test_every_value_is_consistent(limb: Scene, terms: np.ndarray):
     numbers = inertial_fields(limb.model, 1, terms)
     moments = numbers["body_inertia"]
     assert numbers["body_mass"] == pytest.approx(2.0 * np.exp(2 * terms[0])) and np.all(moments > 0)
@@ -165,8 +165,8 @@ def test_every_value_is_a_body_that_can_exist(limb: Scene, terms: np.ndarray):
 
 @given(terms=terms_strategy, other=terms_strategy)
 @settings(deadline=None, max_examples=30)
-def test_every_body_that_can_exist_has_its_values(limb: Scene, terms: np.ndarray, other: np.ndarray):
-    """From any body to any other: the terms are the logarithm of what lies between both roots."""
+def test_every_consistent_body_has_its_values(limb: Scene, terms: np.ndarray, other: np.ndarray):
+    """From any body to any other: the terms are the logarithm of the factor between both roots."""
     aim, model = inertial_fields(limb.model, 1, terms), mujoco.MjSpec.from_string(LIMB).compile()
     for field, number in inertial_fields(limb.model, 1, other).items():
         getattr(model, field)[1] = number
@@ -182,7 +182,7 @@ def test_zero_is_the_body_itself(limb: Scene):
 
 
 def test_a_replay_has_the_inertia_of_an_mjcf_that_states_it(limb: Scene):
-    """In C, which takes short cuts where a body's centre is its frame's, and in MJX; and in the files of a fit."""
+    """In C, whose shortcuts for a centred inertial frame must be disabled, in MJX, and in a fit's files."""
     space = both_bodies(limb)
     values = np.random.default_rng(2).normal(0.0, 0.3, 20)
     spec = limb.spec.copy()
@@ -208,8 +208,8 @@ def test_a_replay_has_the_inertia_of_an_mjcf_that_states_it(limb: Scene):
     np.testing.assert_allclose(physics.dof_invweight0, stated.dof_invweight0, rtol=1e-5)
 
 
-def test_what_needs_mujoco_alone_writes_the_same(limb: Scene, tmp_path: Path):
-    """Fitted values and draws, into a model and a spec; whatever was written before is replaced."""
+def test_the_neutral_result_writes_the_same(limb: Scene, tmp_path: Path):
+    """Fitted values and draws, into a model and a spec; earlier writes are replaced."""
     space = both_bodies(limb)
     gaussian = prior(space)
     values = np.random.default_rng(3).normal(0.0, 0.2, 20)
@@ -234,7 +234,7 @@ def test_what_needs_mujoco_alone_writes_the_same(limb: Scene, tmp_path: Path):
     assert fitted_files(limb, space, values).changes
 
 
-def test_a_file_asks_for_an_inertia_in_one_line(limb: Scene, tmp_path: Path):
+def test_a_file_states_an_inertia_in_one_entry(limb: Scene, tmp_path: Path):
     file = tmp_path / "p.json"
     file.write_text(json.dumps([{"inertia": "upper", "std": 0.2}, {"servo": "lift", "std": 0.1}]))
     space = load_parameters(file, limb)

@@ -1,4 +1,4 @@
-"""A fitted scene as MJCF is read by MuJoCo as the very model that was fitted."""
+"""MuJoCo reads the MJCF of a fitted scene as the fitted model."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ GEOMS = """<mujoco>
 
 
 def test_the_built_in_door_comes_back_as_it_was_fitted() -> None:
-    """All parameters of the door and all nuisances away from their means."""
+    """All parameters of the door and all nuisances differ from their means."""
     scene = dj.door_scene()
     space = dj.door_space(scene) + door_nuisances(scene)
     values = np.clip(space.mean + 0.5 * space.std, space.low, space.high)
@@ -54,8 +54,8 @@ def test_the_built_in_door_comes_back_as_it_was_fitted() -> None:
 
 
 @pytest.mark.parametrize("heavier", ["arm", "tip"])
-def test_a_mass_that_geoms_make_up(heavier: str) -> None:
-    """The other body keeps what its geoms weigh."""
+def test_a_mass_that_comes_from_geoms(heavier: str) -> None:
+    """The other body keeps the mass of its geoms."""
     scene = compile_scene(mujoco.MjSpec.from_string(GEOMS), "geoms")
     space = Space((body_mass(scene, heavier, std=0.2, high=50.0),))
     values = 1.3 * space.mean
@@ -70,7 +70,7 @@ def test_a_mass_that_geoms_make_up(heavier: str) -> None:
     "turned", ['diaginertia=".03 .025 .02" euler="20 30 40"', 'fullinertia=".03 .025 .02 .001 .002 .003"']
 )
 def test_a_mass_that_the_body_states(turned: str) -> None:
-    """Its inertia is turned as the file says, in whatever words."""
+    """Its inertia has the orientation of the file, by any attribute."""
     stated = GEOMS.replace('<compiler inertiafromgeom="true"/>', "").replace(
         '<joint name="swing"', f'<inertial pos="0 .1 .2" mass="2" {turned}/><joint name="swing"'
     )
@@ -82,7 +82,7 @@ def test_a_mass_that_the_body_states(turned: str) -> None:
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-4, atol=1e-5)
 
 
-def test_what_has_no_name_is_written_too() -> None:
+def test_elements_without_names_are_written() -> None:
     """Bodies and contact pairs, as MJCF allows."""
     pairs = '<contact><pair geom1="bar" geom2="end" friction="1 1 0.1 0 0"/></contact></mujoco>'
     nameless = GEOMS.replace('<body name="tip" ', "<body ").replace("</mujoco>", pairs)
@@ -123,7 +123,7 @@ def one(scene: Scene, field: str, index: tuple[int, ...], value: float) -> Space
 
 @pytest.mark.parametrize(("field", "index", "value"), WRITTEN)
 def test_every_field_that_has_an_attribute_is_written(field: str, index: tuple[int, ...], value: float):
-    """And nothing else changes, however the file says where things are; without the looks, which lie behind."""
+    """Nothing else changes, whichever attributes the file uses; visual geoms come last."""
     scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
     index = (scene.id("geom", "bone"), *index[1:]) if field.startswith("geom_") else index
     space = one(scene, field, index, value)
@@ -137,8 +137,8 @@ def test_every_field_that_has_an_attribute_is_written(field: str, index: tuple[i
         np.testing.assert_allclose(getattr(written, name), axis, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-def test_looks_keep_their_weight_in_what_is_written():
-    """The mass of what is only for the eye counts in the file as it does in the replay."""
+def test_the_mass_of_visual_geoms_is_kept():
+    """It counts in the file as in the replay."""
     scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
     space = one(scene, "dof_damping", (0,), 2.0)
     written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, space.mean))
@@ -146,7 +146,7 @@ def test_looks_keep_their_weight_in_what_is_written():
     assert written.body("arm").mass[0] > 0.2 + 1000 * 0.2 * np.pi * 0.03**2  # the bone alone, about
 
 
-def test_what_mjcf_cannot_say_is_named():
+def test_parameters_that_mjcf_cannot_express_are_listed():
     scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
     offset = Parameter("time_offset", "s", 0.0, 0.1, -1.0, 1.0)
     space = one(scene, "dof_damping", (0,), 2.0) + one(scene, "actuator_acc0", (0,), 2.0) + Space((offset,))
@@ -154,8 +154,8 @@ def test_what_mjcf_cannot_say_is_named():
     fitted_mjcf(scene, space, space.mean)
 
 
-def test_an_inertia_that_no_body_can_have_is_said():
-    """Fitted about one axis alone, beyond the sum of the other two: a replay takes it."""
+def test_an_inconsistent_inertia_is_refused():
+    """A replay accepts a moment fitted about one axis that exceeds the sum of the others."""
     scene = compile_scene(mujoco.MjSpec.from_string(TURNED), "turned")
     space = one(scene, "body_inertia", (1, 1), 5.0)
     with pytest.raises(ValueError, match=r"^the fitted values make no MJCF: .*inertia.*A \+ B >= C.*arm"):
@@ -174,7 +174,7 @@ FACES = "f 1 2 4\nf 1 4 3\nf 5 8 6\nf 5 7 8\nf 1 6 2\nf 1 5 6\nf 3 4 8\nf 3 8 7\
 
 
 def test_meshes_are_found_from_any_folder(tmp_path: Path):
-    """meshdir is relative to the file that was read; what is written lies elsewhere."""
+    """meshdir is relative to the file; the written file is elsewhere."""
     (tmp_path / "robot" / "parts").mkdir(parents=True)
     corners = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
     (tmp_path / "robot" / "parts" / "cube.obj").write_text(corners + FACES)
@@ -212,8 +212,8 @@ WORKED_OUT = """<mujoco>{compiler}<worldbody><body name="arm"><joint name="swing
     ],
 )
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
-def test_what_a_compiler_works_out_from_masses_stays_as_it_was_replayed(changes: dict, values: dict):
-    """A damping ratio, a spring's period, a bound on masses: they would be asked of the fitted masses again."""
+def test_numbers_derived_from_masses_are_written(changes: dict, values: dict):
+    """A damping ratio, a spring's period and a bound on masses would be derived from the fitted masses."""
     text = WORKED_OUT.format(**{"compiler": "", "joint": "", "servo": "", "dummy": "", **changes})
     scene = compile_scene(mujoco.MjSpec.from_string(text), "worked out")
     space = Space(
@@ -227,8 +227,8 @@ def test_what_a_compiler_works_out_from_masses_stays_as_it_was_replayed(changes:
         np.testing.assert_allclose(getattr(written, field), getattr(expected, field), rtol=1e-3, atol=1e-6)
 
 
-def test_the_shape_of_a_mesh_stays_as_the_file_has_it(tmp_path: Path):
-    """Its compiled place holds the mesh's own frame: written, it would be applied twice."""
+def test_the_shape_of_a_mesh_is_unchanged(tmp_path: Path):
+    """Its compiled pose contains the mesh's frame, which would be applied twice."""
     corners = [(x, y, z) for x in (0, 2) for y in (0, 1) for z in (0, 3)]
     (tmp_path / "brick.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + FACES)
     (tmp_path / "arm.xml").write_text(
@@ -245,8 +245,8 @@ def test_the_shape_of_a_mesh_stays_as_the_file_has_it(tmp_path: Path):
     np.testing.assert_allclose(written.geom_quat, scene.model.geom_quat, atol=1e-6)
 
 
-def test_a_tendon_rests_at_the_length_that_it_was_replayed_with():
-    """Without a stated length it is the one at qpos0, which a moved body changes."""
+def test_the_rest_length_of_a_tendon_is_written():
+    """By default it is the length at qpos0, which a moved body changes."""
     xml = """<mujoco><worldbody><site name="wall" pos="0 0 1"/>
       <body name="arm" pos="0 0 .2"><joint name="swing" axis="0 1 0"/><geom size=".05" pos="0 0 .3" mass="1"/>
       <site name="tip" pos=".1 0 .2"/></body></worldbody>

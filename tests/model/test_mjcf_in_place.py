@@ -1,4 +1,4 @@
-"""The fitted MJCF is the user's own: only numbers change, wherever they stand."""
+"""The fitted MJCF is the user's file with changed numbers."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def scene(tmp_path: Path) -> Scene:
 
 
 def written(made: FittedFiles, folder: Path) -> mujoco.MjModel:
-    """The model of the files, in a folder of their own."""
+    """The model of the files, in a separate folder."""
     for name, text in made.files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
@@ -106,8 +106,8 @@ def test_only_numbers_change_and_the_model_is_the_fitted_one(scene: Scene, tmp_p
     assert "diaginertia" in arm and 'range="-45 ' in arm
 
 
-def test_friction_that_a_fit_holds_is_held_in_the_own_file(tmp_path: Path, scene: Scene):
-    """On the joints that the scene holds; the others keep what the file says."""
+def test_hard_friction_is_written_into_the_users_file(tmp_path: Path, scene: Scene):
+    """For joints that the scene holds; others keep the file's impedance."""
     held = load_scene(tmp_path / "robot.xml", hold=True)
     assert set(held.held) == {"swing", "twist"}
     space = Space((joint_damping(held, "swing", std=1.0, high=20.0),))
@@ -121,8 +121,8 @@ def test_friction_that_a_fit_holds_is_held_in_the_own_file(tmp_path: Path, scene
     assert "solimpfriction" not in made.files["fitted.xml"] and made.files["fitted_parts/arm.xml"].count("0.9999") == 4
 
 
-def test_the_patch_changes_the_own_files(scene: Scene, tmp_path: Path):
-    """By the program `patch`, where there is one; without paths, which only the copy needs."""
+def test_the_patch_changes_the_users_files(scene: Scene, tmp_path: Path):
+    """By the program `patch`, if there is one; without paths, which only the copy needs."""
     import shutil
     import subprocess
 
@@ -158,10 +158,8 @@ def test_changes_say_where_a_number_came_from(scene: Scene):
         ('<position joint="swing" kp="30" dampratio="1"/>', '<motor joint="swing" gear="3"/>', ""),
     ],
 )  # fmt: skip
-def test_what_numbers_alone_cannot_say_is_written_by_mujoco(
-    tmp_path: Path, scene: Scene, old: str, new: str, reason: str
-):
-    """With the reason; and the model is the fitted one all the same."""
+def test_other_changes_are_written_by_mujoco(tmp_path: Path, scene: Scene, old: str, new: str, reason: str):
+    """With the reason; the model is the fitted one."""
     (tmp_path / "robot.xml").write_text(MAIN.replace(old, new))
     other = load_scene(tmp_path / "robot.xml", engine="mujoco")
     space = Space((body_mass(other, "tip", std=0.1, high=3.0),))
@@ -173,14 +171,14 @@ def test_what_numbers_alone_cannot_say_is_written_by_mujoco(
     assert [c.attribute for c in made.changes if c.name == "tip"].count("mass") == 1
 
 
-def test_a_file_that_was_changed_meanwhile_is_not_taken_for_the_fitted_one(scene: Scene, tmp_path: Path):
+def test_a_file_that_was_changed_meanwhile_is_not_edited(scene: Scene, tmp_path: Path):
     (tmp_path / "robot.xml").write_text(MAIN.replace('kp="30"', 'kp="50"'))
     space = Space((joint_damping(scene, "swing", std=1.0, high=20.0),))
     made = fitted_files(scene, space, np.array([3.0]))
     assert not made.in_place and "actuator_" in made.reason
 
 
-def test_a_body_without_numbers_of_its_own_gets_a_line(scene: Scene, tmp_path: Path):
+def test_a_body_without_inertial_gets_one(scene: Scene, tmp_path: Path):
     space = Space((body_mass(scene, "cart", std=0.1, high=90.0),))
     made = fitted_files(scene, space, 1.5 * space.mean)
     assert made.in_place, made.reason

@@ -1,4 +1,4 @@
-"""Closest points of capsule axes against a float64 search, and the switch that puts them into MJX."""
+"""Closest points of capsule axes against a float64 search, and the switch that uses them in MJX."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from droid_jax.model.mjx_internals import (
 
 
 def mjx_point(a, b, p):
-    """What mjx itself calls, whatever stands there now."""
+    """The function that mjx calls now."""
     return getattr(*SEGMENT_POINT)(a, b, p)
 
 
 def brute_point(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """The best of many points, refined around it: no formula shared with the code under test."""
+    """The best of many points, refined around it; no formula is shared with the tested code."""
     low, high = 0.0, 1.0
     for _ in range(8):
         t = np.linspace(low, high, 41)
@@ -95,7 +95,7 @@ def test_capsule_distances_are_exact_inside_the_context():
 
 
 def test_the_bias_it_removes_is_real():
-    """On a rail of 18 mm MJX's own function is off by 28 micrometres at its end."""
+    """On a rail of 18 mm MJX's function has an error of 28 micrometres at its end."""
     a, b = np.zeros(3), np.array([0.018, 0.0, 0.0])
     off = mjx_point(jnp.asarray(a), jnp.asarray(b), jnp.asarray(b)) - b
     assert 2.5e-5 < float(np.abs(off).max()) < 6e-5
@@ -114,7 +114,7 @@ def test_the_original_comes_back_even_after_an_error():
     np.testing.assert_array_equal(mjx_point(a, b, b), biased)
 
 
-def test_two_threads_that_trace_at_once_leave_mjx_as_it_was():
+def test_two_threads_that_trace_at_once_restore_mjx():
     """One enters while the other is inside, and leaves after it."""
     functions = getattr(*SEGMENT_POINT), getattr(*CONSTRAINT_LAW)
     a, b = jnp.zeros(3), jnp.array([0.018, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Parameters of a user's own scene from a file: what it says about mistakes."""
+"""Parameters of a user's scene from a file, and messages about mistakes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def loaded(folder: Path, scene: Scene, entry: dict[str, Any]):
 
 
 def test_a_file_is_utf_8_whatever_wrote_it(tmp_path: Path, scene: Scene):
-    """Editors on Windows put a byte order mark first, or write another encoding."""
+    """Editors on Windows may write a byte order mark or another encoding."""
     path, text = tmp_path / "parameters.json", json.dumps([{**GOOD, "name": "Öl"}], ensure_ascii=False)
     path.write_text(text, encoding="utf-8-sig")
     assert load_parameters(path, scene).names == ("Öl",)
@@ -41,7 +41,7 @@ def test_a_file_is_utf_8_whatever_wrote_it(tmp_path: Path, scene: Scene):
         load_parameters(path, scene)
 
 
-def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
+def test_an_entry_is_read(tmp_path: Path, scene: Scene):
     more = {"mode": "scale", "scaling": "log", "log_offset": 0.1, "width": 0.5, "nuisance": True, "low": 0, "mean": 2}
     parameter = loaded(tmp_path, scene, {**GOOD, **more, "name": "oil", "unit": "-", "group": "Arm"})["oil"]
     assert parameter.writes[0].mode is Mode.SCALE and parameter.scaling is Scaling.LOG
@@ -50,15 +50,15 @@ def test_an_entry_is_read_as_it_says(tmp_path: Path, scene: Scene):
     assert loaded(tmp_path, scene, height)["arm_pos"].writes[0].index == (scene.id("body", "arm"), 2)
 
 
-def test_a_negative_gain_starts_at_what_the_model_has(tmp_path: Path):
-    """A servo's damping is minus its third bias: 2, where the file says -2."""
+def test_a_negative_gain_starts_at_the_models(tmp_path: Path):
+    """A servo's damping is minus its third bias: 2 for -2 in the file."""
     servo = mujoco.MjSpec.from_string(XML.replace('kp="20"', 'kp="20" kv="2"'))
     scene = compile_scene(servo, "arm", joints=["elbow"])
     entry = {"field": "actuator_biasprm", "element": "elbow", "column": 2, "std": 0.5, "high": 9, "mode": "negative"}
     assert loaded(tmp_path, scene, entry)["elbow_biasprm"].mean == 2.0
 
 
-def test_a_mass_takes_its_inertia_along_also_where_the_usual_mode_is_stated(tmp_path: Path, scene: Scene):
+def test_a_mass_scales_its_inertia_also_with_a_stated_mode(tmp_path: Path, scene: Scene):
     entry = {"field": "body_mass", "element": "arm", "std": 0.1, "high": 3.0}
     plain, stated = loaded(tmp_path, scene, entry), loaded(tmp_path, scene, {**entry, "mode": "set"})
     assert plain == stated and len(stated["arm_mass"].writes) == 4 and stated["arm_mass"].unit == "kg"
@@ -127,14 +127,14 @@ def test_a_mistake_is_named(tmp_path: Path, scene: Scene, changes: dict[str, Any
     assert says in str(caught.value) and "parameters.json, entry 1: " in str(caught.value)
 
 
-def test_numbers_that_are_none_are_refused_with_the_file(tmp_path: Path, scene: Scene):
+def test_nan_is_refused_with_the_files_name(tmp_path: Path, scene: Scene):
     with pytest.raises(ValueError, match=r"parameters\.json: NaN is no number of JSON"):
         loaded(tmp_path, scene, {**GOOD, "log_offset": float("nan")})
     with pytest.raises(ValueError, match=r"parameters\.json: entry 0, 'std': a whole number beyond 2\^63"):
         loaded(tmp_path, scene, {**GOOD, "std": 10**400})
 
 
-def test_a_name_that_is_there_twice_is_told_where(tmp_path: Path, scene: Scene):
+def test_a_repeated_name_is_refused_with_both_entries(tmp_path: Path, scene: Scene):
     path = tmp_path / "parameters.json"
     path.write_text(json.dumps([GOOD, {**GOOD, "name": "oil"}, GOOD]))
     with pytest.raises(ValueError, match=r"parameters\.json, entry 3: 'elbow_damping' is entry 1 already"):
@@ -179,8 +179,8 @@ def test_a_list_of_joints_makes_one_parameter_that_they_share(tmp_path: Path):
     np.testing.assert_allclose(model.actuator_forcerange[0], [-1.5, 1.5])
 
 
-def test_a_parameter_of_each_is_what_entries_of_their_own_make(tmp_path: Path):
-    """Also of each joint's columns together, and of sensors, which have names of their own."""
+def test_each_equals_separate_entries(tmp_path: Path):
+    """Also with several columns of each joint, and for sensors, which have fixed names."""
     limited = TWO.replace('kp="8"', 'kp="8" forcerange="-1 1"')
     scene, both = compile_scene(mujoco.MjSpec.from_string(limited), "arm"), ["elbow", "wrist"]
     entries = (
@@ -196,20 +196,23 @@ def test_a_parameter_of_each_is_what_entries_of_their_own_make(tmp_path: Path):
         expected = [loaded(tmp_path, scene, one).parameters[0] for one in apart]
         assert list(loaded(tmp_path, scene, together).parameters) == expected
     for wrong in ({"element": "elbow"}, {"element": []}):
-        with pytest.raises(ValueError, match='"each" is of a list of elements; element is'):
+        with pytest.raises(ValueError, match='"each" needs a list of elements; element is'):
             loaded(tmp_path, scene, {**GOOD, **wrong, "each": True})
 
 
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ({"field": "dof_damping"}, 'elbow_damping is 1 in the model and wrist_damping is 2: state the mean .*"scale"'),
+        (
+            {"field": "dof_damping"},
+            'elbow_damping is 1 in the model and wrist_damping is 2: state a common mean.*"scale"',
+        ),
         ({"sensor": "coulomb"}, "a sensor's term belongs to one joint"),
-        ({"field": "dof_damping", "element": []}, "an empty list names nothing"),
+        ({"field": "dof_damping", "element": []}, "element: the list is empty"),
         ({"field": "dof_damping", "element": ["elbow", "knee"]}, "unknown joint 'knee'"),
     ],
 )
-def test_what_cannot_be_shared_is_refused(tmp_path: Path, entry: dict[str, Any], said: str):
+def test_invalid_shared_parameters_are_refused(tmp_path: Path, entry: dict[str, Any], said: str):
     scene = compile_scene(mujoco.MjSpec.from_string(TWO), "arm")
     with pytest.raises(ValueError, match=r"parameters\.json, entry 1: .*" + said):
         loaded(tmp_path, scene, {"element": ["elbow", "wrist"], "std": 0.1, "high": 9.0, **entry})
@@ -222,14 +225,14 @@ def test_joints_that_share_a_friction_loss_each_get_their_row(tmp_path: Path):
     assert friction_joints(tmp_path / "parameters.json") == ("elbow", "wrist")
 
 
-def test_an_entry_like_another_stands_for_it(tmp_path: Path, scene: Scene):
+def test_an_entry_like_another_replaces_it(tmp_path: Path, scene: Scene):
     path = tmp_path / "parameters.json"
     path.write_text(json.dumps([{**GOOD, "name": "oil"}, {"like": "oil", "name": "old oil", "std": 0.2}]))
     oil, old = load_parameters(path, scene).parameters
     assert (old.unit, old.low, old.high, old.mean) == (oil.unit, oil.low, oil.high, oil.mean)
     assert (old.std, old.writes, old.role) == (0.2, (), Role.STANDS_FOR) and oil.writes
     for entry, said in (
-        ({"like": "grease", "name": "old"}, "no entry before it has the name 'grease'; there: oil"),
+        ({"like": "grease", "name": "old"}, "no entry before it has the name 'grease'; names are: oil"),
         ({"like": "oil"}, "missing name"),
         ({"like": "oil", "name": "old", "column": 1}, "leave column out"),
     ):

@@ -49,7 +49,7 @@ def test_mean_is_the_origin_and_one_deviation_is_one_unit():
     assert up[1] == pytest.approx(1.0)
 
 
-def test_zero_is_reachable_with_a_floor():
+def test_zero_is_reachable_with_a_log_offset():
     assert SPACE.to_search(np.zeros(3))[1] > -10
     assert SPACE.from_search(np.array([0.0, -50.0, 0.0]))[1] == 0.0
 
@@ -131,7 +131,7 @@ def test_check_says_which_value_is_outside(bad: float):
 
 
 def test_check_takes_a_bound_in_single_precision_for_the_bound():
-    """0.01 is 0.00999999978 in float32; a millionth of the range is no other value."""
+    """0.01 is 0.00999999978 in float32; a millionth of the range counts as rounding."""
     space = Space((linear(mean=0.05, low=0.01, high=0.1),))
     for bound in (0.01, 0.1):
         single = np.array([np.float32(bound)])
@@ -185,7 +185,7 @@ def of_name(name: str, **options) -> Parameter:
         ("payload_mass", Role.OTHER),  # an effect's, which says so itself
     ],
 )
-def test_what_a_replay_reads_has_its_role_by_name(name: str, role: Role):
+def test_parameters_in_theta_have_their_role_by_name(name: str, role: Role):
     assert of_name(name).role is role
     assert of_name(name, writes=(Write("dof_damping", (0,)),)).role is Role.OTHER  # a model's field is read there
 

@@ -1,4 +1,4 @@
-"""Applying parameter values equals compiling an MJCF that has them, in C and in MJX."""
+"""Applying parameter values equals compiling an MJCF with them, in C and in MJX."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def vectors(space: Space) -> np.ndarray:
 
 
 def edited(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjModel:
-    """The same values written into the MJCF by its own attributes, and compiled."""
+    """The same values written into the MJCF by its attributes, and compiled."""
     v = dict(zip(space.names, values.tolist(), strict=True))
     spec = scene.spec.copy()
     for geom in list(spec.geoms):
@@ -126,7 +126,7 @@ def test_c_model_equals_compilation_field_by_field(scene: Scene, space: Space, v
 
 
 def test_the_oracle_really_changes_the_model(scene: Scene, space: Space, vectors: np.ndarray):
-    """The comparison above would pass on two unchanged models: every declared field differs here."""
+    """The comparison above would pass for two unchanged models, so every declared field must differ here."""
     nominal, compiled = float_fields(scene.model), float_fields(edited(scene, space, vectors[0]))
     for name in written_fields(space):
         if name in ("stat", "tendon_length0", "tendon_invweight0", "eq_data"):
@@ -136,7 +136,7 @@ def test_the_oracle_really_changes_the_model(scene: Scene, space: Space, vectors
 
 
 def mjx_fields(model: Any, path: str = "") -> dict[str, np.ndarray]:
-    """Every floating array of an mjx.Model, parts included."""
+    """All floating-point arrays of an mjx.Model and its parts."""
     out = {}
     for field in dataclasses.fields(model):
         value = getattr(model, field.name)
@@ -185,7 +185,9 @@ def test_only_declared_fields_change(scene: Scene, space: Space, vectors: np.nda
     assert {"body_mass", "dof_damping", "pair_friction", "body_quat", "dof_invweight0"} <= changed
 
 
-def test_the_scene_is_left_alone_and_twice_is_once(scene: Scene, space: Space, vectors: np.ndarray, apply):
+def test_the_scene_is_unchanged_and_applying_twice_is_applying_once(
+    scene: Scene, space: Space, vectors: np.ndarray, apply
+):
     before = {k: v.copy() for k, v in float_fields(scene.model).items()}
     once = float_fields(make_c_model(scene, space, vectors[0]))
     make_c_model(scene, space, vectors[1])
@@ -199,7 +201,7 @@ def test_the_scene_is_left_alone_and_twice_is_once(scene: Scene, space: Space, v
 
 
 def test_the_means_give_the_scene_back(scene: Scene):
-    """The nuisances' means are neutral: nothing moves, in C to the last digits."""
+    """The nuisances' means are neutral: in C to the last digits."""
     space = door_nuisances(scene)
     applied, nominal = float_fields(make_c_model(scene, space, space.mean)), float_fields(scene.model)
     for name, array in nominal.items():
@@ -208,7 +210,7 @@ def test_the_means_give_the_scene_back(scene: Scene):
 
 
 def test_a_first_use_inside_jit_leaves_the_scene_usable():
-    """The mjx.Model is made once and kept: it must not be made of a trace's values."""
+    """The mjx.Model is cached and must not contain values of a trace."""
     fresh = door_scene()
     space = door_space(fresh).select(["hinge_damping"])
     traced = jax.jit(lambda values: make_physics(fresh, space, values).model.dof_damping)
@@ -217,7 +219,7 @@ def test_a_first_use_inside_jit_leaves_the_scene_usable():
 
 
 @pytest.mark.slow
-def test_values_outside_the_model_are_handed_on(scene: Scene, space: Space, vectors: np.ndarray, apply):
+def test_values_outside_the_model_are_in_theta(scene: Scene, space: Space, vectors: np.ndarray, apply):
     expected = {"time_offset", *(f"torque_offset[{j}]" for j in ARM)}
     theta = apply(vectors[0].astype(np.float32)).theta
     assert set(theta) == set(theta_of(space, vectors[0])) == expected
@@ -303,7 +305,7 @@ def heavier(name: str) -> tuple[Scene, Space]:
     return scene, Space((body_mass(scene, "a", std=1.0, high=9.0),))
 
 
-def test_the_c_twin_knows_the_armature_of_tendons():
+def test_the_c_model_has_the_armature_of_tendons():
     """A mass at its nominal value changes nothing."""
     scene, space = heavier("tendons")
     assert scene.model.stat.meaninertia > 1.5  # mostly the tendon's
@@ -312,7 +314,7 @@ def test_the_c_twin_knows_the_armature_of_tendons():
 
 
 def rests(xml: str, field: str, column: int, value: float) -> tuple[float, float, float]:
-    """m, height at which a body stays: in the C twin, in MJX and as the compiled model with that number has it."""
+    """m, resting height of a body: in the C model, in MJX and in the compiled model with that number."""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "fall", joints=["z"])
     space = Space((model_parameter(scene, field, "ball", column, unit="m", std=0.1, low=-1.0, high=1.0),))
     spec = mujoco.MjSpec.from_string(xml)
@@ -332,17 +334,17 @@ def rests(xml: str, field: str, column: int, value: float) -> tuple[float, float
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("field", "column", "value"), [("geom_pos", 2, -0.1), ("geom_size", 0, 0.15)])
-def test_a_geom_that_was_moved_or_grew_touches_in_both_engines(field: str, column: int, value: float):
+def test_a_geom_that_was_moved_or_enlarged_touches_in_both_engines(field: str, column: int, value: float):
     xml = """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .3"><joint name="z" type="slide"
       damping="30" axis="0 0 1"/><geom name="ball" size=".05" mass="1"/></body></worldbody>
       <actuator><motor joint="z"/></actuator></mujoco>"""
-    twin, mjx_, compiled_ = rests(xml, field, column, value)
+    in_c, mjx_, compiled_ = rests(xml, field, column, value)
     assert compiled_ > -0.2  # 0.05 would lie at -0.25
-    np.testing.assert_allclose([twin, mjx_], compiled_, atol=1e-3)
+    np.testing.assert_allclose([in_c, mjx_], compiled_, atol=1e-3)
 
 
 def test_a_moved_joint_axis_is_derived_too():
-    """jnt_pos and jnt_axis change the inertia that a joint feels."""
+    """jnt_pos and jnt_axis change the inertia about a joint."""
     xml = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><geom size=".1 .2 .3" type="box" pos=".1 0 0"/>
       </body></worldbody><actuator><position joint="j" kp="1"/></actuator></mujoco>"""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "rod")
@@ -362,7 +364,7 @@ def test_a_moved_joint_axis_is_derived_too():
 
 @pytest.mark.slow
 def test_a_tilted_axis_stays_a_unit_vector():
-    """Of (0, 0, 1) with x set to a half: a compiler scales it, and what is applied equals what it compiles."""
+    """(0, 0, 1) with x set to a half is normalised, as by the compiler."""
     xml = """<mujoco><worldbody><body><joint name="j" axis="0 0 1"/><geom size=".1 .2 .3" type="box" pos=".1 0 0"/>
       </body></worldbody><actuator><position joint="j" kp="1"/></actuator></mujoco>"""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "rod")
@@ -383,7 +385,7 @@ def test_parameters_without_masses_derive_nothing(scene: Scene):
 
 
 def test_parameters_of_one_entry_act_one_after_the_other():
-    """A nuisance that scales a gain and an effect that scales it again: neither hides the other."""
+    """A nuisance that scales a gain and an effect that scales it again both act."""
     scene = door_scene()
     first, second = (servo_scale(scene, ARM[2], name=n) for n in ("first", "second"))
     space = Space((first, second))
@@ -397,17 +399,17 @@ def test_parameters_of_one_entry_act_one_after_the_other():
 
 
 @pytest.mark.parametrize("flag", ["spring", "damper"])
-def test_a_flag_that_mjx_takes_for_both_is_refused(flag: str):
+def test_disabling_springs_only_is_refused(flag: str):
     xml = f"""<mujoco><option><flag {flag}="disable"/></option><worldbody><body><joint name="j" damping="1"/>
       <geom size=".1"/></body></worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
-    with pytest.raises(ValueError, match="springs without dampers, or the other way round"):
+    with pytest.raises(ValueError, match="springs without dampers, or dampers without springs"):
         compile_scene(mujoco.MjSpec.from_string(xml), "flagged")
     both = xml.replace(f'{flag}="disable"', 'spring="disable" damper="disable"')
     compile_scene(mujoco.MjSpec.from_string(both), "flagged")
 
 
-def test_what_mjx_would_leave_out_is_refused(scene: Scene):
-    """A hand-made write too: nothing is accepted and then never applied."""
+def test_fields_that_mjx_ignores_are_refused(scene: Scene):
+    """Also of a write that was made by hand."""
     for field, says in (("actuator_damping", "does not simulate it"), ("geom_fluid", "takes it as fixed")):
         write = Write(field, (0,) if field == "actuator_damping" else (0, 0))
         unread = Space((Parameter("unread", "-", 0.5, 0.1, 0.0, 1.0, writes=(write,)),))
@@ -430,17 +432,17 @@ MOVED = [("body_ipos", "cart", {"centre": 0.3}), ("jnt_pos", "y", {"joint": 0.3}
 
 
 def moved(folder: Path, field: str, element: str, **changes: Any) -> tuple[Scene, Space]:
-    """The cart, and its centre or its joint as a parameter."""
+    """The cart, with its centre of mass or its joint as a parameter."""
     (folder / "cart.xml").write_text(SIMPLE.format(**{**PLAIN, **changes}))
     scene = load_scene(folder / "cart.xml")
     return scene, Space((model_parameter(scene, field, element, 2, name="z", unit="m", std=0.1, low=-1.0, high=1.0),))
 
 
 @pytest.mark.parametrize(("field", "element", "as_compiled"), MOVED)
-def test_a_body_that_c_took_a_short_cut_by_moves_as_compiled(
+def test_shortcuts_of_c_are_disabled_for_a_moved_centre(
     tmp_path: Path, field: str, element: str, as_compiled: dict[str, float]
 ):
-    """Its frame was its inertia's: C refused a moved centre."""
+    """The inertial frame was the body's frame before."""
     scene, space = moved(tmp_path, field, element)
     assert scene.model.body_simple[1]
     check_space(scene, space)

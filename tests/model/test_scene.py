@@ -1,4 +1,4 @@
-"""The built-in scene and users' scenes: kinematics, limits, variants, and what is refused."""
+"""The built-in scene and users' scenes: kinematics, limits, variants, and refused features."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def flange_pose(q: np.ndarray) -> np.ndarray:
 
 
 def test_an_mjcf_whose_files_are_given(tmp_path: Path):
-    """As environments ship them: includes and meshes by name, in no folder of their own."""
+    """As environments have them: includes and meshes by name, without a folder."""
     mesh = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     arm = (
         "<mujoco><asset><mesh name='box' file='box.obj'/></asset><worldbody><body><joint name='elbow'/>"
@@ -90,7 +90,7 @@ def test_joint_and_torque_limits(door: Scene):
 
 
 def test_gravity_of_the_robot_is_compensated(door: Scene):
-    """No actuator torque, anywhere in the workspace: the arm and the fingers stay where they are."""
+    """Without actuator torque the arm and the fingers stay where they are, anywhere in the workspace."""
     model, data = door.model.__copy__(), mujoco.MjData(door.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     robot = [door.dof(j) for j in (*ARM, *FINGERS)]
@@ -114,7 +114,7 @@ def test_springs_stiffen_the_hinge():
 
 
 @pytest.mark.parametrize(("size", "expected"), [((320, 240), (640, 480)), ((1920, 240), (1920, 480))])
-def test_pictures_fit_the_buffer_of_a_scene_that_asked_for_a_smaller_one(size, expected):
+def test_the_offscreen_buffer_is_large_enough(size, expected):
     asked = f'<mujoco><visual><global offwidth="{size[0]}" offheight="{size[1]}"/></visual><worldbody>'
     body = '<body name="arm"><joint name="elbow"/><geom size="0.1"/></body>'
     spec = mujoco.MjSpec.from_string(f"{asked}{body}</worldbody></mujoco>")
@@ -181,7 +181,7 @@ def test_the_fitted_columns_lie_inside_the_space(door: Scene, springs: int):
     door_space(door).check(door_space(door).values(column))
 
 
-def test_scene_variants_are_named_when_refused():
+def test_unknown_scene_variants_are_refused():
     for wrong, says in (
         (dict(springs=3), "springs must be at most 2, got 3"),
         (dict(knob=4), "knob must be at most 3, got 4"),
@@ -266,8 +266,8 @@ def mechanism(**filled: str) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(TEMPLATE.format(**{**slots, **filled}))
 
 
-def test_joints_are_freed_of_their_ranges_by_name():
-    """All that are named, out of a generator too."""
+def test_unlimited_joints_are_given_by_name():
+    """All named joints, also from a generator."""
     xml = """<mujoco><compiler autolimits="true"/><worldbody>
       <body><joint name="a" range="-9 9"/><geom size=".1"/><body pos="0 0 1"><joint name="b" range="-9 9"/>
       <geom size=".1"/><body pos="0 0 1"><joint name="c" range="-9 9"/><geom size=".1"/></body></body></body>
@@ -303,23 +303,23 @@ def test_a_plain_mechanism_is_accepted():
         (dict(option='noslip_iterations="3"'), "noslip solver"),
     ],
 )
-def test_what_mjx_would_ignore_is_refused_by_name(filled: dict, says: str):
+def test_features_that_mjx_ignores_are_refused_by_name(filled: dict, says: str):
     with pytest.raises(ValueError, match=rf"scene 'rod' uses features.*{says}"):
         compile_scene(mechanism(**filled), "rod")
 
 
-def test_all_that_mjx_would_ignore_is_listed_at_once():
+def test_all_ignored_features_are_listed_at_once():
     with pytest.raises(ValueError, match="polynomial joint stiffness, actuator delay"):
         compile_scene(mechanism(joint='stiffness="1 2 3"', actuator='delay="0.01" nsample="20"'), "rod")
 
 
-def test_joints_of_several_degrees_are_refused():
+def test_ball_and_free_joints_are_refused():
     for wrong in (dict(joints=["free"]), dict(object_joint="free")):
         with pytest.raises(ValueError, match="joint 'free' of scene 'rod' must be a hinge or a slide"):
             compile_scene(mechanism(), "rod", **wrong)
 
 
-def test_actuators_that_drive_no_joint_go_by_their_own_name():
+def test_actuators_that_drive_no_joint_have_their_own_name():
     spec = mechanism()
     pull = spec.add_actuator(name="pull", target="t", trntype=mujoco.mjtTrn.mjTRN_TENDON)
     scene = compile_scene(spec, "rod")
@@ -331,7 +331,7 @@ def test_actuators_that_drive_no_joint_go_by_their_own_name():
             compile_scene(spec, "rod")
 
 
-def test_friction_loss_rows_exist_only_where_asked(tmp_path: Path):
+def test_friction_loss_rows_exist_only_where_requested(tmp_path: Path):
     file = tmp_path / "rod.xml"
     file.write_text(
         TEMPLATE.format(**dict.fromkeys(("option", "joint", "geom", "pair", "tendon", "actuator", "sensor"), ""))
@@ -349,8 +349,8 @@ def test_friction_loss_rows_exist_only_where_asked(tmp_path: Path):
         load_scene(urdf, friction_joints=["k"])
 
 
-def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
-    """Geoms of group 2 go where nothing can touch them; their mass stays with their body."""
+def test_visual_geoms_are_removed_without_a_change_of_mass():
+    """Only geoms of group 2 that cannot collide are removed; their mass stays with their body."""
     xml = """<mujoco>{compiler}<worldbody><geom name="floor" type="plane" size="1 1 1"/>
       <body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0"/>
         <geom name="bone" type="capsule" size=".02 .2"/>
@@ -377,7 +377,7 @@ def test_what_is_only_for_the_eye_weighs_and_touches_as_before():
 
 
 @pytest.mark.parametrize("compiler", ["", '<compiler inertiafromgeom="true"/>'])
-def test_a_body_may_weigh_by_its_looks_alone(compiler: str):
+def test_a_body_may_have_visual_geoms_only(compiler: str):
     xml = f"""<mujoco>{compiler}<worldbody><body name="a"><joint name="j"/>
       <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1" group="2" contype="0" conaffinity="0"/>
       <body name="b" pos=".3 0 0"><joint name="k"/><geom size=".1" density="500"/></body></body></worldbody>
@@ -390,10 +390,10 @@ def test_a_body_may_weigh_by_its_looks_alone(compiler: str):
 
 
 @pytest.mark.parametrize("option", ['integrator="implicit"', 'solver="PGS"'])  # a scene for the C engine alone
-def test_what_mjx_has_not_is_said_in_a_sentence(option: str):
+def test_features_that_mjx_lacks_are_refused_in_a_sentence(option: str):
     xml = f"""<mujoco><option {option}/><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
       <actuator><position name="j" joint="j" kp="9"/></actuator></mujoco>"""
-    with pytest.raises(ValueError, match="scene 'new' uses something that MJX has not"):
+    with pytest.raises(ValueError, match="scene 'new' uses something that MJX does not support"):
         compile_scene(mujoco.MjSpec.from_string(xml), "new", engine="mujoco").mjx  # noqa: B018
 
 
@@ -412,7 +412,7 @@ def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):
         load_scene(broken)
 
 
-def test_a_scene_without_such_a_thing_says_so():
+def test_a_scene_without_elements_of_a_kind_says_so():
     scene = compile_scene(mujoco.MjSpec.from_string("<mujoco/>"), "empty")
     with pytest.raises(ValueError, match="unknown pair 'grip'; this scene has no pair with a name"):
         scene.id("pair", "grip")
@@ -424,7 +424,7 @@ SERVO_AND_DAMPER = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><ge
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_of_several_actuators_of_a_joint_the_position_servo_takes_its_command(turned: bool):
+def test_the_position_servo_of_several_actuators_has_the_joints_name(turned: bool):
     pair = ['<position name="p" joint="j" kp="100"/>', '<velocity name="damper" joint="j" kv="5"/>']
     text = SERVO_AND_DAMPER.format("".join(reversed(pair) if turned else pair))
     scene = compile_scene(mujoco.MjSpec.from_string(text), "two")
@@ -441,7 +441,7 @@ def test_of_several_actuators_of_a_joint_the_position_servo_takes_its_command(tu
         '<position name="a" joint="j"/><position name="b" joint="j"/>',
     ],
 )
-def test_actuators_of_which_none_is_the_joints_own_go_by_their_own_names(actuators: str):
+def test_several_actuators_without_a_single_servo_have_their_own_names(actuators: str):
     scene = compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(actuators)), "two")
     assert scene.command_names == ("a", "b", "k") and scene.joints == scene.needs_command == ("k",)
 
@@ -449,8 +449,14 @@ def test_actuators_of_which_none_is_the_joints_own_go_by_their_own_names(actuato
 @pytest.mark.parametrize(
     ("actuators", "said"),
     [
-        ('<position joint="j"/><velocity joint="j" kv="1"/>', "actuator 1 has another one beside it: give it a name"),
-        ('<position joint="j"/><velocity name="k" joint="j"/>', "'k' has another one beside it: give it a name that"),
+        (
+            '<position joint="j"/><velocity joint="j" kv="1"/>',
+            "actuator 1 shares its joint with another one: give it a name",
+        ),
+        (
+            '<position joint="j"/><velocity name="k" joint="j"/>',
+            "'k' shares its joint with another one: give it a name that",
+        ),
     ],
 )
 def test_actuators_beside_a_servo_need_names(actuators: str, said: str):
@@ -458,13 +464,13 @@ def test_actuators_beside_a_servo_need_names(actuators: str, said: str):
         compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(actuators)), "two")
 
 
-def test_a_damper_beside_a_servo_needs_no_command_where_something_is_gripped():
+def test_a_damper_in_addition_to_a_servo_needs_no_command():
     pair = '<position name="p" joint="j" kp="100"/><velocity name="damper" joint="j" kv="5"/>'
     scene = compile_scene(mujoco.MjSpec.from_string(SERVO_AND_DAMPER.format(pair)), "two", grip=Grip(()))
     assert scene.needs_command == ("j", "k")
 
 
-def test_joints_between_the_world_and_what_is_measured():
+def test_joints_that_carry_measured_joints():
     spec = mujoco.MjSpec.from_string("""<mujoco><worldbody>
       <body name="base"><freejoint name="root"/><geom size=".1"/>
         <body name="hip"><joint axis="0 1 0"/><geom size=".1"/>
@@ -485,7 +491,7 @@ def test_joints_between_the_world_and_what_is_measured():
         "<mujoco><worldbody><body name='\u202ea\u2028b'><geom size='0'/></body></worldbody></mujoco>",
     ],
 )
-def test_what_mujoco_says_of_a_file_is_one_line(tmp_path, text):
+def test_mujocos_message_about_a_file_is_one_line(tmp_path, text):
     path = tmp_path / "own.xml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError) as refused:
@@ -493,7 +499,7 @@ def test_what_mujoco_says_of_a_file_is_one_line(tmp_path, text):
     assert str(refused.value).startswith(f"{path}: ") and len(str(refused.value).splitlines()) == 1
 
 
-def test_dry_friction_is_held_unless_the_mjcf_says_how_hard_it_is(tmp_path: Path):
+def test_dry_friction_is_hardened_unless_the_mjcf_sets_its_impedance(tmp_path: Path):
     joint = '<joint name="{0}" axis="0 1 0" {1}/><inertial pos="0 0 0.1" mass="1" diaginertia="1 1 1"/>'
     rubs = 'frictionloss="0.3"'
     own, slow = f'{rubs} solimpfriction="0.99 0.99"', f'{rubs} solreffriction="0.1 1"'

@@ -58,14 +58,14 @@ def arm(equality: str = "none", tip: str = "") -> mujoco.MjModel:
 
 
 def smooth(model: Any, data: Any) -> Any:
-    """Everything before the constraint solver."""
+    """The quantities before the constraint solver."""
     with exact_segments():
         data = mjx.fwd_position(model, data)
     return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, mjx.fwd_velocity(model, data)))
 
 
 def solver(model: mujoco.MjModel, firm: bool = False) -> Callable[..., tuple[Any, dict[str, jax.Array]]]:
-    """Batched: (qpos, qvel, warm start) -> the solved data, and the problem that was solved."""
+    """Batched: (qpos, qvel, warm start) -> the solved data and the problem."""
     on_device = mjx.put_model(model)
     template = mjx.make_data(on_device)
 
@@ -81,7 +81,7 @@ def solver(model: mujoco.MjModel, firm: bool = False) -> Callable[..., tuple[Any
 
 
 def minimum(problem: dict[str, np.ndarray], equalities: int, dry: int, start: np.ndarray) -> np.ndarray:
-    """The same convex problem in float64: damped Newton on the cost itself, to its end."""
+    """The same convex problem in float64, by damped Newton on the cost."""
     M, f, J, D, aref, loss = (np.asarray(problem[k], float) for k in ("M", "f", "J", "D", "aref", "dry"))
     kind = np.full(len(D), 2)
     kind[:equalities], kind[equalities : equalities + dry] = 0, 1
@@ -107,7 +107,7 @@ def minimum(problem: dict[str, np.ndarray], equalities: int, dry: int, start: np
 
 
 def states(model: mujoco.MjModel, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random states, as float32 numbers, among them all kinds of active constraints."""
+    """Random states as float32 numbers, with all kinds of active constraints."""
     rng = np.random.default_rng(seed)
     qpos = np.stack(
         [rng.uniform(-0.45, 1.55, count), rng.uniform(-1.05, 1.05, count), rng.normal(0, 0.5, count),
@@ -118,7 +118,7 @@ def states(model: mujoco.MjModel, count: int, seed: int) -> tuple[np.ndarray, np
 
 
 def reference(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray, set[int]]:
-    """qacc and constraint forces of the C engine at 100 iterations, and the kinds of rows it met."""
+    """qacc and constraint forces of the C engine at 100 iterations, and the kinds of its rows."""
     qacc, force, kinds = np.empty_like(qvel), np.empty_like(qvel), set()
     data = mujoco.MjData(model)
     for i, (q, v) in enumerate(zip(qpos, qvel, strict=True)):
@@ -155,7 +155,7 @@ def case(request) -> tuple:
 
 
 def error(got: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """[N] largest error of each state over the scale of its own accelerations."""
+    """[N] largest error of each state, relative to the scale of its accelerations."""
     return np.abs(got - expected).max(axis=1) / (1.0 + np.abs(expected).max(axis=1))
 
 
@@ -164,7 +164,7 @@ def error(got: np.ndarray, expected: np.ndarray) -> np.ndarray:
 QACC_TOLERANCE = 2e-3
 
 
-def test_the_states_meet_every_kind_of_constraint(case):
+def test_the_states_have_every_kind_of_constraint(case):
     name, _, _, _, _, (_, _, kinds) = case
     wanted = EXPECTED_KINDS | ({int(KINDS.mjCNSTR_EQUALITY)} if name != "none" else set())
     assert kinds >= wanted
@@ -180,7 +180,7 @@ def test_accelerations_are_those_of_the_c_engine(case):
 
 
 def test_the_minimum_is_that_of_a_float64_newton(case):
-    """On MJX's own rows, so that nothing but the solver is tested: float32 keeps five digits."""
+    """With MJX's rows, so that only the solver is tested; float32 keeps five digits."""
     _, model, qpos, qvel, run, (qacc, _, _) = case
     rows = constraint_rows(mjx.make_data(mjx.put_model(model)))
     (got, _), problems = run(qpos, qvel, np.zeros_like(qvel))
@@ -193,7 +193,7 @@ def test_the_minimum_is_that_of_a_float64_newton(case):
     assert error(np.asarray(got), exact).max() < 1e-5
 
 
-def test_any_warm_start_ends_at_the_same_place(case):
+def test_any_warm_start_gives_the_same_solution(case):
     _, _, qpos, qvel, run, (qacc, _, _) = case
     rng = np.random.default_rng(11)
     for scale in (1.0, 100.0):
@@ -203,14 +203,14 @@ def test_any_warm_start_ends_at_the_same_place(case):
 
 
 @pytest.mark.slow
-def test_the_warm_start_of_the_answer_stays_there(case):
+def test_the_solution_as_warm_start_is_kept(case):
     _, _, qpos, qvel, run, (qacc, _, _) = case
     assert error(np.asarray(run(qpos, qvel, qacc.astype(np.float32))[0][0]), qacc).max() < QACC_TOLERANCE
 
 
 @pytest.mark.parametrize("size", [1, 3, 8, UNROLLED, UNROLLED + 1])
 def test_a_gpu_solves_the_same_systems(monkeypatch, size: int):
-    """Its way of building and solving them, run on a CPU, against float64: stiff rows beside soft ones."""
+    """The GPU's implementation, run on a CPU, against float64, with stiff and soft rows."""
     rng = np.random.default_rng(size)
     jacobian, weights = rng.normal(size=(5, 20, size)), 10.0 ** rng.uniform(-2, 3, (5, 20))
     inertia, right = np.eye(size) * rng.uniform(0.1, 2.0, size), rng.normal(size=(5, size))
@@ -252,7 +252,7 @@ def light_arm(joints: int, timestep: float = 0.004) -> mujoco.MjModel:
 
 @pytest.mark.parametrize("joints", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_firm_friction_of_many_joints_is_that_of_the_c_engine(joints: int):
-    """Below and above the number of rows up to which the corners are looked at at once."""
+    """With fewer and more rows than EXACT_ROWS."""
     model, rng = light_arm(joints), np.random.default_rng(3)
     qpos = rng.uniform(-0.5, 0.5, (100, joints)).astype(np.float32).astype(float)
     qvel = (rng.normal(0, 0.5, qpos.shape) * (rng.random(qpos.shape) > 0.5)).astype(np.float32).astype(float)
@@ -263,11 +263,11 @@ def test_firm_friction_of_many_joints_is_that_of_the_c_engine(joints: int):
 
 
 @pytest.mark.slow
-def test_a_light_arm_that_steps_and_holds_goes_where_c_goes():
-    """Five joints, 6 s of steps, against C at an eighth of the step, where it holds.
+def test_a_light_arm_that_steps_and_holds_agrees_with_c():
+    """Five joints, 6 s of steps, against C with an eighth of the step, compared while the arm holds.
 
-    Velocities stand half a step before positions, so a command that jumps acts half a step early: 8 mrad while the arm
-    is on its way.  A replay makes up for that (`late` of `servo_replay`), a step by itself does not.
+    Velocities are half a step before positions, so a command that jumps acts half a step early: 8 mrad while the arm
+    moves.  A replay compensates that (`late` of `servo_replay`), a single step does not.
     """
     goals = 0.5 * np.random.default_rng(1).uniform(-1, 1, (4, 5))
 
@@ -305,7 +305,7 @@ SPINNER = """<mujoco><compiler angle="radian"/>
 
 @functools.cache
 def spinner(joint: str, steps: int, parity: bool) -> Callable[[float, float], tuple[jax.Array, jax.Array]]:
-    """(torque, speed at the start) -> position and velocity [steps], compiled once."""
+    """(torque, initial speed) -> position and velocity [steps], compiled once."""
     on_device = mjx.put_model(mujoco.MjModel.from_xml_string(SPINNER.format(joint=joint)))
     start = mjx.make_data(on_device)
 
@@ -328,8 +328,8 @@ def run_spinner(
 
 
 @pytest.mark.parametrize("parity", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_dry_friction_decelerates_by_its_own_torque(parity: bool):
-    """I dv/dt = -0.5 N m until the joint stands: v = v0 - 5 t, from either side."""
+def test_dry_friction_decelerates_by_its_torque(parity: bool):
+    """I dv/dt = -0.5 N m until the joint stops: v = v0 - 5 t, from either side."""
     for sign in (1.0, -1.0):
         _, velocity = run_spinner("", torque=0.0, speed=sign * 1.0, steps=200, parity=parity)
         t = 0.002 * np.arange(1, 201)
@@ -340,7 +340,7 @@ def test_dry_friction_decelerates_by_its_own_torque(parity: bool):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parity", [True, False])
-def test_dry_friction_lets_only_the_excess_through(parity: bool):
+def test_dry_friction_transmits_the_excess_torque_only(parity: bool):
     _, velocity = run_spinner("", torque=0.8, speed=0.0, steps=200, parity=parity)
     # a = (0.8 - 0.5) / 0.1 = 3 rad/s^2, after a short creep while the friction builds up
     assert np.diff(velocity[100:]).mean() / 0.002 == pytest.approx(3.0, rel=1e-3)
@@ -428,15 +428,15 @@ def test_the_default_step_is_of_second_order():
 
 
 def _half_back(model: mujoco.MjModel, h: float) -> np.ndarray:
-    """The velocity half a step before the start, where the leapfrog keeps it: from rest, -h/2 a."""
+    """The velocity half a step before the start, as the leapfrog needs it: from rest, -h/2 a."""
     data = mujoco.MjData(model)
     data.qpos[0] = 0.3
     mujoco.mj_forward(model, data)
     return -0.5 * h * data.qacc
 
 
-def test_midpoint_law_is_its_own_derivation():
-    """J a = (-b v - k d r - R f) / (1 + b h / 2): the damping, stiffness x impedance and R it says."""
+def test_midpoint_law_follows_its_equation():
+    """J a = (-b v - k d r - R f) / (1 + b h / 2): damping, stiffness x impedance and R."""
     model, own_law = mjx.put_model(arm()), getattr(*CONSTRAINT_LAW)
     solref, solimp, position = jnp.array([0.02, 1.0]), jnp.array([0.9, 0.95, 0.001, 0.5, 2.0]), jnp.array(-4e-4)
     k, b, d = own_law(model, solref, solimp, position)

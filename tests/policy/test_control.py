@@ -1,4 +1,4 @@
-"""The control loop: it sees what training saw, keeps to the limits, stops when it must, and needs numpy alone."""
+"""The control loop: the observation of the training, limits, stops, and no dependency but numpy."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def still(scene, start) -> Reading:
     return reading(scene, data)
 
 
-def test_it_sees_what_training_saw(scene, start, interface):
-    """Own kinematics of numpy against MuJoCo's, at random poses of arm, fingers and door."""
+def test_the_observation_is_that_of_the_training(scene, start, interface):
+    """Kinematics in numpy against MuJoCo's, at random poses of arm, fingers and door."""
     rng = np.random.default_rng(1)
     for _ in range(20):
         data = state(scene, start, rng)
@@ -87,7 +87,7 @@ def test_it_sees_what_training_saw(scene, start, interface):
         np.testing.assert_allclose(control.observe(interface, reading(scene, data)), expected, atol=1e-9)
 
 
-def test_inside_all_limits_an_action_reaches_from_where_the_joints_are(interface):
+def test_an_action_is_relative_to_the_joints_positions(interface):
     gentle = replace(interface, effort=np.full(7, np.inf), ranges=np.tile([-np.inf, np.inf], (7, 1)))
     action = np.array([1.0, -5.0, 0, 0, 0, 0, 0.5, -1.0, 3.0])
     found = control.limited(gentle, Safety(), np.full(7, 0.5), action)
@@ -95,7 +95,7 @@ def test_inside_all_limits_an_action_reaches_from_where_the_joints_are(interface
     np.testing.assert_allclose(found.fingers, [0.0, TASK.width], atol=1e-9)
 
 
-def test_training_commands_what_the_robot_will_do(interface):
+def test_training_uses_the_limits_of_the_robot(interface):
     rng = np.random.default_rng(2)
     for _ in range(20):
         position, action = rng.normal(size=7), rng.uniform(-1.5, 1.5, 9)
@@ -140,9 +140,9 @@ def test_a_good_reading_is_acted_on(policy, still):
         (lambda r: replace(r, torque=[[1.0], [1.0, 2.0]]), "a reading that cannot be read"),
         (lambda r: replace(r, position=r.position + 2 * np.pi * np.eye(7)[6]), "out of range: joint 7"),
         (lambda r: replace(r, position=r.position - 0.5 * np.eye(7)[0]), "the hand has left its workspace"),
-        (lambda r: replace(r, knob=1e3 * r.knob), "the knob's pose is no pose"),
-        (lambda r: replace(r, sight=-0.09), "stale sight of the knob: it is of -0.09 s, the reading of 0.02 s"),
-        (lambda r: replace(r, sight=np.nan), "stale sight of the knob"),
+        (lambda r: replace(r, knob=1e3 * r.knob), "the knob's pose is invalid"),
+        (lambda r: replace(r, sight=-0.09), "stale pose of the knob: it is of -0.09 s, the reading of 0.02 s"),
+        (lambda r: replace(r, sight=np.nan), "stale pose of the knob"),
     ],
 )  # fmt: skip
 def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
@@ -159,13 +159,13 @@ def test_it_stops_and_holds_the_pose(policy, still, spoil, why: str):
     np.testing.assert_array_equal(again.arm, still.position)
 
 
-def test_there_is_no_beginning_from_a_bad_reading(policy, still):
+def test_an_invalid_first_reading_is_refused(policy, still):
     with pytest.raises(ValueError, match="cannot begin: position holds a value that is NaN or infinite"):
         Controller(policy).act(replace(still, position=np.full(7, np.nan)))
 
 
 @pytest.mark.parametrize("moved", [np.array([0.0, 0.06, 0.0]), np.array([300.0, 0.0, 0.0])])
-def test_a_knob_that_is_elsewhere_is_no_beginning(policy, still, moved):
+def test_a_displaced_knob_is_refused_at_the_beginning(policy, still, moved):
     knob = still.knob.copy()
     knob[:3, 3] += moved
     with pytest.raises(ValueError, match=r"cannot begin: the knob is elsewhere: [\d.]+ m and 0.00 rad"):
@@ -173,18 +173,18 @@ def test_a_knob_that_is_elsewhere_is_no_beginning(policy, still, moved):
 
 
 @pytest.mark.parametrize(("turned", "begins"), [(0.1, True), (0.3, False), (np.pi / 2, False)])
-def test_a_knob_that_is_turned_is_no_beginning(policy, still, turned, begins):
-    """A camera's frame that is not the base's would drive the arm."""
+def test_a_turned_knob_is_refused_at_the_beginning(policy, still, turned, begins):
+    """A pose in the camera's frame, not the base's, would drive the arm."""
     knob, c, s = still.knob.copy(), np.cos(turned), np.sin(turned)
     knob[:3, :3] = knob[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     if begins:
         assert Controller(policy).act(replace(still, knob=knob)).stopped is None
         return
-    with pytest.raises(ValueError, match=rf"0.00 m and {turned:.2f} rad from where it was"):
+    with pytest.raises(ValueError, match=rf"0.00 m and {turned:.2f} rad from its pose in training"):
         Controller(policy).act(replace(still, knob=knob))
 
 
-def test_a_policy_for_the_next_place_of_the_knob_does_not_begin(policy, scene):
+def test_a_policy_for_another_knob_location_is_refused(policy, scene):
     next_place = door_scene(limits=True, knob=1)
     own = interface_of(next_place, TASK, waiting_pose(next_place, TASK))
     data = mujoco.MjData(scene.model)
@@ -195,20 +195,20 @@ def test_a_policy_for_the_next_place_of_the_knob_does_not_begin(policy, scene):
         Controller(replace(policy, interface=own)).act(at_the_limit)
 
 
-def test_a_camera_may_be_a_little_behind(policy, still):
+def test_a_pose_of_the_knob_may_be_slightly_old(policy, still):
     loop = Controller(policy)
     assert loop.act(replace(still, sight=-0.05)).stopped is None
     assert loop.act(replace(still, time=0.02, sight=-0.05)).stopped is None
 
 
-def test_later_the_knob_may_go_with_its_door(policy, still):
+def test_the_knob_may_move_after_the_beginning(policy, still):
     loop, knob = Controller(policy), still.knob.copy()
     loop.act(still)
     knob[:3, 3] -= [0.1, 0.0, 0.0]
     assert loop.act(replace(still, time=0.02, knob=knob)).stopped is None
 
 
-def test_a_driver_may_write_into_what_it_handed_over(policy, still):
+def test_readings_are_copied(policy, still):
     loop, buffer = Controller(policy), still.position.copy()
     loop.act(replace(still, position=buffer))
     buffer[:] = np.nan
@@ -217,7 +217,7 @@ def test_a_driver_may_write_into_what_it_handed_over(policy, still):
     np.testing.assert_array_equal(held.arm, still.position)
 
 
-def test_a_policy_that_gives_no_numbers_is_stopped(policy, still):
+def test_a_policy_that_gives_nan_is_stopped(policy, still):
     loop = Controller(policy)
     loop.act(still)
     loop.policy = replace(policy, biases=(policy.biases[0], np.full(2 * ACTIONS, np.nan)))
@@ -226,7 +226,7 @@ def test_a_policy_that_gives_no_numbers_is_stopped(policy, still):
     np.testing.assert_array_equal(held.arm, still.position)
 
 
-def test_a_command_that_is_no_number_is_stopped(policy, still):
+def test_a_command_with_nan_is_stopped(policy, still):
     loop = Controller(policy)
     loop.act(still)
     loop.policy = replace(policy, interface=replace(policy.interface, width=np.nan))
@@ -236,7 +236,7 @@ def test_a_command_that_is_no_number_is_stopped(policy, still):
     )
 
 
-def test_readings_that_come_too_fast_stop_it(policy, still):
+def test_early_readings_stop_the_loop(policy, still):
     loop = Controller(policy)
     loop.act(still)
     assert loop.act(replace(still, time=0.0001)).stopped == "early: 0 ms between readings, expected 20"
@@ -265,7 +265,7 @@ def test_a_robot_without_torque_sensors_is_fine(policy, still):
 
 
 class Arm:
-    """A robot that stands still, whose clock fails after some readings."""
+    """A robot that does not move, whose clock fails after some readings."""
 
     def __init__(self, reading: Reading, good: int):
         self.reading, self.good, self.time, self.sent = reading, good, 0.0, list[Command]()
@@ -289,7 +289,7 @@ def test_driving_ends_with_the_time_or_with_a_stop(policy, still):
     assert arm.sent[-1].stopped is not None
 
 
-def test_a_robot_that_fails_is_told_to_hold(policy, still):
+def test_a_robot_that_fails_is_sent_a_command_to_hold(policy, still):
     arm = Arm(still, 1000)
 
     def fail() -> Reading:
@@ -303,8 +303,8 @@ def test_a_robot_that_fails_is_told_to_hold(policy, still):
     np.testing.assert_array_equal(arm.sent[-1].arm, still.position)
 
 
-def test_numpy_is_all_it_needs(policy, still, tmp_path: Path):
-    """A copy of the file beside a policy, in a Python that is refused everything but numpy."""
+def test_only_numpy_is_needed(policy, still, tmp_path: Path):
+    """A copy of the file beside a policy, in a Python that can import numpy only."""
     save_policy(tmp_path / "policy.npz", policy)
     (tmp_path / "control.py").write_text(Path(control.__file__).read_text())
     np.savez(tmp_path / "reading.npz", position=still.position, fingers=still.fingers, knob=still.knob)

@@ -1,4 +1,4 @@
-"""Episodes in the simulation: what is counted, until when, and that physics differ."""
+"""Episodes in simulation: what is counted, until when, and that physics differ."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BLANK: Any = Interface(**{name: np.zeros(shape) for name, shape in SHAPES.items(
 
 
 class Opening(Env):
-    """A door that opens by its width and its height, and by what the policy does."""
+    """A door that opens by its width and its height, and by the policy's action."""
 
     sys: Any = Door(jnp.zeros(()), jnp.ones(()))
     task, interface = SimpleNamespace(steps=2), BLANK
@@ -52,7 +52,7 @@ class Opening(Env):
 
 
 def network(weight: float) -> Policy:
-    """What it sees times a weight, before tanh."""
+    """A policy whose action is tanh of its observation times a weight."""
     weights = (np.full((1, 18), weight),)
     return Policy(np.zeros(1), np.ones(1), weights, (np.zeros(18),), BLANK)
 
@@ -62,7 +62,7 @@ def draws(sys: Door, rng: Any) -> tuple[Door, Door]:
 
 
 def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.MonkeyPatch):
-    """Its numbers would make it another one to the compiler, which takes longer than the episodes."""
+    """Policies and physics are inputs of the program, whose compilation takes longer than the episodes."""
     programs, jit = list[str](), jax.jit
 
     def spied(function: Any, **options: Any) -> Any:
@@ -93,7 +93,7 @@ def test_a_policy_of_another_robot_is_refused():
 
 @jax.tree_util.register_static
 class Still:
-    """A policy that keeps the arm where it is and the fingers open."""
+    """A policy that keeps the arm at rest and the fingers open."""
 
     def __init__(self, interface: Interface):
         self.interface = interface
@@ -103,7 +103,7 @@ class Still:
 
 
 @pytest.mark.slow
-def test_a_hand_that_stays_opens_nothing_and_steps_count_until_success():
+def test_a_hand_at_rest_opens_nothing_and_steps_count_until_success():
     scene = door_scene(timestep=0.004, limits=True)
     env, randomise = DoorEnv(scene, Task(steps=10)), randomised(scene, prior(door_space(scene)))
     found = simulated(Still(env.interface), env, randomise, 3)  # type: ignore[arg-type]

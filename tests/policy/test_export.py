@@ -19,7 +19,7 @@ from brax.envs.base import Env, State
 from droid_jax.policy import control
 from droid_jax.policy.control import ACTIONS, LAYOUT, OBSERVED, SHAPES, Interface, Policy, load_policy
 from droid_jax.policy.export import CLOSE, difference, export, to_onnx
-from droid_jax.policy.parallel import AXIS, Doors, wrapped
+from droid_jax.policy.parallel import AXIS, RandomisedEnvs, wrapped
 from droid_jax.storage import WRITTEN
 
 onnx = pytest.importorskip("onnx")
@@ -42,8 +42,8 @@ def test_onnx_acts_as_jax_does(policy):
     assert difference(policy, to_onnx(policy)) <= CLOSE
 
 
-def test_the_difference_is_seen(policy):
-    """Another policy's file is not taken for this one's."""
+def test_another_policys_model_differs(policy):
+    """Another policy's ONNX model is detected."""
     other = replace(policy, biases=(policy.biases[0] + 1e-3, *policy.biases[1:]))
     assert difference(other, to_onnx(policy)) > CLOSE
 
@@ -56,7 +56,7 @@ def test_one_observation_or_many(policy):
     np.testing.assert_allclose(one[0], policy.act(np.zeros(OBSERVED)), atol=CLOSE)
 
 
-def test_the_file_says_what_its_numbers_mean(policy):
+def test_the_metadata_describe_the_numbers(policy):
     notes = {p.key: p.value for p in onnx.load_from_string(to_onnx(policy)).metadata_props}
     assert json.loads(notes["observation"]) == list(LAYOUT) and len(json.loads(notes["action"])) == ACTIONS
     assert (notes["period, s"], notes["reach, rad"], notes["width, m"]) == ("0.02", "0.1", "0.04")
@@ -79,7 +79,7 @@ def test_without_onnx_it_says_what_to_install(policy, tmp_path: Path, monkeypatc
         export(tmp_path, policy)
 
 
-def test_a_policy_that_onnx_does_not_follow_is_not_written(policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_policy_that_differs_in_onnx_is_not_written(policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("droid_jax.policy.export.difference", lambda policy, model: np.nan)
     with pytest.raises(ValueError, match="it is not written"):
         export(tmp_path / "out", policy)
@@ -121,8 +121,8 @@ def randomise(sys: Physics, rng) -> tuple[Physics, Any]:
     return Physics(jax.vmap(jax.random.uniform)(rng), sys.gravity), Physics(0, None)
 
 
-def stiffnesses(doors: Doors, devices: int, act: bool) -> np.ndarray:
-    """[devices, COUNT] what the environments of each device see at reset, or after a step."""
+def stiffnesses(doors: RandomisedEnvs, devices: int, act: bool) -> np.ndarray:
+    """[devices, COUNT] observed stiffness of the environments of each device at reset, or after a step."""
 
     def run(rng):
         state = doors.reset(rng)
@@ -135,24 +135,28 @@ def stiffnesses(doors: Doors, devices: int, act: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("act", [False, True])
-def test_every_environment_of_every_device_has_its_own_physics(act: bool):
+def test_environments_on_all_devices_have_different_physics(act: bool):
     assert jax.local_device_count() >= 2
     env = Spring()
-    found = stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act)
+    found = stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act)
     assert len(np.unique(found)) == 2 * COUNT
-    np.testing.assert_array_equal(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act), found)
-    assert not np.intersect1d(stiffnesses(Doors(env, randomise, COUNT, 2, jax.random.PRNGKey(2)), 2, act), found).size
+    np.testing.assert_array_equal(
+        stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(1)), 2, act), found
+    )
+    assert not np.intersect1d(
+        stiffnesses(RandomisedEnvs(env, randomise, COUNT, 2, jax.random.PRNGKey(2)), 2, act), found
+    ).size
     assert env.sys is Spring.sys  # as it was
 
 
-def test_outside_of_braxs_devices_there_is_one():
-    doors = Doors(Spring(), randomise, COUNT, 2, jax.random.PRNGKey(1))
+def test_without_a_mapped_axis_the_device_index_is_zero():
+    doors = RandomisedEnvs(Spring(), randomise, COUNT, 2, jax.random.PRNGKey(1))
     alone = jax.jit(doors.reset)(jax.random.split(jax.random.PRNGKey(0), COUNT)).obs[:, 2]
     np.testing.assert_array_equal(alone, doors.physics.stiffness[:COUNT])
 
 
-def test_what_is_tried_is_not_what_is_trained_on():
-    """brax wraps the environment twice, and gives both the same keys where they are as many."""
+def test_evaluations_have_other_physics_than_training():
+    """brax wraps the environment twice, with the same keys if the counts are equal."""
     keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
     wrap_env = wrapped(randomise, 2, 1)
     trained, tried = (wrap_env(Spring(), 10, 1, partial(randomise, rng=keys)).reset(keys).obs[:, 2] for _ in range(2))
@@ -161,8 +165,8 @@ def test_what_is_tried_is_not_what_is_trained_on():
     np.testing.assert_array_equal(again, trained)
 
 
-def test_what_is_tried_does_not_depend_on_the_devices():
-    """Other doors were tried on another number of them, and another policy was the best."""
+def test_physics_of_evaluations_do_not_depend_on_the_devices():
+    """Otherwise the number of devices could change the selected policy."""
     keys = jax.random.split(jax.random.PRNGKey(0), COUNT)
     tried = list[Any]()
     for devices in (1, 2):

@@ -1,4 +1,4 @@
-"""The policy as numbers: brax's own network is the oracle, and files that are not as they should be are named."""
+"""Policies as arrays: brax's network is the reference, and invalid files are refused with a reason."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def networks():
 
 @pytest.fixture(scope="module")
 def parameters(networks):
-    """A normaliser that has seen something, and an actor's initial weights."""
+    """A normaliser after some updates, and an actor's initial weights."""
     normaliser = running_statistics.init_state(specs.Array((OBSERVED,), jnp.dtype("float32")))
     seen = 3.0 + 2.0 * jax.random.normal(jax.random.key(0), (500, OBSERVED))
     return running_statistics.update(normaliser, seen), networks.policy_network.init(jax.random.key(1))
@@ -63,7 +63,7 @@ def test_it_acts_as_braxs_deterministic_policy(networks, parameters, policy):
     assert np.abs(policy.act(observations)).max() <= 1.0 and policy.act(observations[0]).shape == (ACTIONS,)
 
 
-def test_a_file_brings_it_back(policy, tmp_path: Path):
+def test_a_saved_policy_is_read_back(policy, tmp_path: Path):
     save_policy(tmp_path / "policy.npz", policy)
     found = load_policy(tmp_path / "policy.npz")
     observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
@@ -123,7 +123,7 @@ def damaged(path: Path, name: str, content: bytes) -> None:
         ),
     ],
 )
-def test_files_that_are_not_as_they_should_be(policy, tmp_path: Path, spoil, expected: str):
+def test_invalid_files_are_refused(policy, tmp_path: Path, spoil, expected: str):
     path = tmp_path / "policy.npz"
     save_policy(path, policy)
     spoil(path)
@@ -141,7 +141,7 @@ def test_another_layout_of_observations_is_refused(policy, tmp_path: Path):
 
 
 @pytest.mark.parametrize("other", [[LAYOUT], ["y" * 100_000], [f"\x1b{LAYOUT[0]}", *LAYOUT[1:]]])
-def test_a_layout_that_is_no_list_of_short_names_is_told_in_one_short_line(policy, tmp_path: Path, other):
+def test_the_message_about_an_invalid_layout_is_short(policy, tmp_path: Path, other):
     path = tmp_path / "policy.npz"
     save_policy(path, policy)
     rewritten(path, lambda found: found.update(layout=np.array(other)))

@@ -1,4 +1,4 @@
-"""Randomised physics: every row is what its draw makes of the scene, and nothing else is batched."""
+"""Randomised physics: each row is a draw applied to the scene, and nothing else is batched."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ def keys():
 
 @pytest.fixture(scope="module")
 def bench() -> tuple[Scene, Space]:
-    """A small scene whose parameters, of a mass among them, are all in the model."""
+    """A small scene whose parameters, also a mass, are all in the model."""
     scene, space = small_scene()
     return scene, Space(tuple(p for p in space.parameters if p.writes))
 
 
 def rows(physics: Physics, batched: Physics, k: int) -> Physics:
-    """Row k, as vmap would hand it on."""
+    """Row k, as vmap gives it."""
     leaves, tree = jax.tree.flatten(physics)
     at = jax.tree.leaves(batched, is_leaf=lambda leaf: leaf is None)
     return jax.tree.unflatten(tree, [leaf if axis is None else leaf[k] for leaf, axis in zip(leaves, at, strict=True)])
@@ -70,7 +70,7 @@ def rows(physics: Physics, batched: Physics, k: int) -> Physics:
     [("bench", "door", "door_damping"), pytest.param("door", "hinge", "hinge_damping", marks=pytest.mark.slow)],
 )
 def test_every_row_is_its_draw(request: pytest.FixtureRequest, keys, of: str, joint: str, damping: str):
-    """The door's physics compiles for half a minute, in both ways that are compared; the small scene's for seconds."""
+    """The door's physics compiles for half a minute in both ways that are compared, the small scene's for seconds."""
     if of == "bench":
         scene, space = request.getfixturevalue("bench")
         gaussian = prior(space + effect_space(library(scene, ["latch"])))
@@ -92,7 +92,7 @@ def test_every_row_is_its_draw(request: pytest.FixtureRequest, keys, of: str, jo
 
 
 def test_only_what_is_written_is_batched(scene, gaussian):
-    """On the door, by shape: nothing is compiled for that."""
+    """On the door, by shapes, without compilation."""
     batched = axes(scene, gaussian.space)
     values = jax.ShapeDtypeStruct((ENVS, len(gaussian.space)), jnp.float32)
     physics = jax.eval_shape(lambda rows: physics_of(scene, gaussian.space, rows), values)
@@ -114,8 +114,8 @@ def test_without_randomisation_all_are_alike(scene, gaussian, keys):
 
 
 @pytest.mark.slow
-def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, gaussian, keys):
-    """Of a fit that is far from its prior."""
+def test_the_three_methods_are_prior_mean_and_posterior(scene, gaussian, keys):
+    """With a fit far from its prior."""
     at = gaussian.space.index("hinge_damping")
     fit = replace(gaussian, mean=gaussian.mean + 3.0 * np.eye(len(gaussian.mean))[at], cov=gaussian.cov / 100)
     middle = fit.centre[at]
@@ -133,7 +133,7 @@ def test_the_three_methods_are_the_prior_the_fits_middle_and_its_draws(scene, ga
 
 
 @pytest.mark.slow
-def test_an_environment_that_knows_a_model_only_is_told_what_it_lacks(scene, gaussian, keys):
+def test_parameters_outside_the_model_are_warned_of(scene, gaussian, keys):
     space = gaussian.space + effect_space(library(scene, ["latch"]))
     with pytest.warns(UserWarning, match=r"cannot vary .*latch_torque, latch_width"):
         randomise = randomised_model(scene, prior(space))
@@ -144,7 +144,7 @@ def test_an_environment_that_knows_a_model_only_is_told_what_it_lacks(scene, gau
         randomised_model(scene, gaussian)
 
 
-def test_an_environments_own_model_is_kept_but_for_what_varies(bench, keys):
+def test_the_environments_numbers_are_kept_except_for_parameters(bench, keys):
     scene, space = bench
     gaussian = prior(space)
     own = scene.mjx.replace(qpos0=scene.mjx.qpos0 + 0.125)
@@ -155,7 +155,7 @@ def test_an_environments_own_model_is_kept_but_for_what_varies(bench, keys):
         randomised_model(scene, gaussian)(own.replace(dof_damping=own.dof_damping[:2]), keys)
 
 
-def test_what_an_environment_changed_beside_a_parameter_stays(keys):
+def test_other_entries_of_a_written_field_are_kept(keys):
     xml = """<mujoco><worldbody><body><joint name="a" damping="1"/><geom size=".1"/>
       <body pos="0 0 1"><joint name="b" damping="2"/><geom size=".1"/></body></body></worldbody></mujoco>"""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "two", joints=("a", "b"))
@@ -167,7 +167,7 @@ def test_what_an_environment_changed_beside_a_parameter_stays(keys):
 
 
 def test_a_friction_loss_without_a_row_is_refused(keys, tmp_path: Path):
-    """What is drawn would have no effect, and nothing would say so."""
+    """Draws would have no effect."""
     path = tmp_path / "dry.xml"
     path.write_text(
         "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
@@ -182,8 +182,8 @@ def test_a_friction_loss_without_a_row_is_refused(keys, tmp_path: Path):
     randomise(scene.mjx.replace(dof_frictionloss=jnp.zeros(1)), keys)
 
 
-def test_an_environment_with_geoms_for_the_eye_takes_it(keys):
-    """The scene leaves them out, and numbers those behind them otherwise."""
+def test_an_environment_with_visual_geoms_is_supported(keys):
+    """The scene has no visual geoms, so its geom ids differ."""
     xml = """<mujoco><worldbody><body><joint name="j"/>
       <geom name="shell" type="box" size=".1 .1 .1" group="2" contype="0" conaffinity="0" mass="0"/>
       <geom name="tip" size=".1" friction="0.7"/></body></worldbody>
@@ -202,8 +202,8 @@ def test_an_environment_with_geoms_for_the_eye_takes_it(keys):
 
 
 @pytest.mark.slow
-def test_mujoco_playground_takes_it():
-    """Its own wrapper: every pole its own damping and mass, all else shared."""
+def test_mujoco_playground_is_supported():
+    """Through its wrapper: each environment has another damping and mass, the rest is shared."""
     pytest.importorskip("mujoco_playground")
     from mujoco_playground import registry, wrapper
 
@@ -221,8 +221,8 @@ def test_mujoco_playground_takes_it():
 
 
 @pytest.mark.slow
-def test_an_environment_of_brax_takes_it():
-    """A stock one with MJX behind it, through brax's own wrapper."""
+def test_an_environment_of_brax_is_supported():
+    """A stock environment with MJX, through brax's wrapper."""
     envs = pytest.importorskip("brax.envs")
     scene = load_scene(Path(envs.__file__).with_name("assets") / "inverted_pendulum.xml")
     space = Space((joint_damping(scene, "hinge", std=0.5, high=5.0), body_mass(scene, "pole", std=1.0, high=10.0)))
@@ -248,7 +248,7 @@ def test_a_gaussian_of_another_scene_is_refused(scene, gaussian):
 
 
 def test_a_gaussian_of_a_scene_of_the_same_shapes_is_refused_by_its_names(tmp_path: Path):
-    """Two arms of two joints: what was fitted to the one's elbow is no damping of the other's wrist."""
+    """Two arms with two joints: a damping of one arm's elbow is not that of the other's wrist."""
     scenes = {}
     for name in ("elbow", "wrist"):
         joint = f'<joint name="{name}" axis="0 1 0" damping="1"/><geom size=".05" mass="1"/>'
@@ -266,8 +266,8 @@ def test_a_gaussian_of_a_scene_of_the_same_shapes_is_refused_by_its_names(tmp_pa
         randomised(scenes["wrist"], kept)
 
 
-def test_unit_vectors_stay_whole_in_an_environments_model(keys):
-    """What was scaled beside the number that is written belongs to it."""
+def test_unit_vectors_are_replaced_as_a_whole(keys):
+    """Normalisation also changes components that are not written."""
     xml = """<mujoco><worldbody><body name="arm" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size=".1"/>
       </body></worldbody></mujoco>"""
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "one", joints=("a",))
@@ -280,8 +280,8 @@ def test_unit_vectors_stay_whole_in_an_environments_model(keys):
         np.testing.assert_array_equal(getattr(model, field), getattr(drawn.model, field))
 
 
-def test_an_environments_own_constraints_stay_and_anchors_follow(keys):
-    """Of a coupling of joints nothing follows from masses and places, of a weld its torque does not."""
+def test_constraints_of_an_environment_are_kept_and_anchors_derived(keys):
+    """Of a coupling of joints nothing is derived, of a weld all but its torque scale."""
     xml = """<mujoco><worldbody><body name="a"><joint name="a"/><geom size=".1" mass="1"/>
       <body name="b" pos="0 0 1"><joint name="b"/><geom size=".1" mass="1"/></body></body></worldbody><equality>
       <joint joint1="a" joint2="b"/><weld body1="a" body2="b"/><connect body1="a" body2="b" anchor="0 0 .5"/>

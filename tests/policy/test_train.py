@@ -1,4 +1,4 @@
-"""Training through brax: its missing function, networks that come back, and a short run that goes on."""
+"""Training with brax: its missing function, checkpoints, and a short run that continues."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_replacement_of_braxs_missing_function_puts_a_copy_on_every_device()
     np.testing.assert_array_equal(doubled, 2 * np.tile(np.arange(3.0), (len(devices), 1)))
 
 
-def test_jax_is_left_as_it_was():
+def test_jax_is_restored():
     new, old = SimpleNamespace(), SimpleNamespace(device_put_replicated="its own")
     with replicated(new):
         assert new.device_put_replicated is put_replicated
@@ -56,7 +56,7 @@ def test_jax_is_left_as_it_was():
     assert old.device_put_replicated == "its own"
 
 
-def test_networks_come_back_from_a_tree_and_others_are_refused():
+def test_networks_are_restored_from_a_tree_and_others_refused():
     blank = ({"mean": np.zeros(3)}, {"kernel": np.zeros((3, 2))}, {"kernel": np.zeros((3, 1))})
     full = ({"mean": np.ones(3)}, {"kernel": np.full((3, 2), 2.0)}, {"kernel": np.full((3, 1), 3.0)})
     found = from_tree(blank, to_tree(full))
@@ -72,18 +72,18 @@ def test_networks_come_back_from_a_tree_and_others_are_refused():
     ("changes", "said"),
     [
         ({"envs": 33}, "must be a multiple of the 33 environments"),
-        ({"devices": 99}, "99 devices were asked for, there are"),
+        ({"devices": 99}, "99 devices were requested, there are"),
         ({"devices": 0}, "devices must be at least 1, got 0"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"evaluations": 0}, "evaluations must be at least 1, got 0"),
     ],
 )
-def test_settings_that_do_not_go_together_are_refused(changes, said: str):
+def test_inconsistent_settings_are_refused(changes, said: str):
     with pytest.raises(ValueError, match=said):
         train(object.__new__(DoorEnv), config=replace(SHORT, **changes))
 
 
-def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch):
+def test_the_number_of_devices_divides_the_environments(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jax, "local_device_count", lambda: 6)
     assert _devices(SHORT) == 4
     with pytest.raises(ValueError, match="32 environments do not divide among 5 devices"):
@@ -96,19 +96,19 @@ def test_devices_that_do_not_divide_are_left_out(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("devices", [1, 2, 4, 8, 64, 128])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_use_all_devices(monkeypatch: pytest.MonkeyPatch, preset: str, devices: int):
-    """As many as the batch has unrolls: on 64 cores brax could not divide the batch of "quick"."""
+    """At most as many as the batch has unrolls, since brax divides the batch among devices."""
     monkeypatch.setattr(jax, "local_device_count", lambda: devices)
     assert _devices(PRESETS[preset]) == min(devices, PRESETS[preset].batch)
 
 
-def test_the_time_left_is_what_the_rest_takes_at_this_rate():
+def test_the_remaining_time_follows_from_the_rate():
     now = TrainProgress(step=1000, of=4000, seconds=9.0, rate=0.0, reward=0.0, success=0.0)
-    assert replace(now, rate=150.0).left == 20.0 and now.left == float("inf")
-    assert replace(now, rate=150.0, step=4096).left == 0.0  # whole rounds may be more than was asked for
+    assert replace(now, rate=150.0).remaining == 20.0 and now.remaining == float("inf")
+    assert replace(now, rate=150.0, step=4096).remaining == 0.0  # whole rounds may be more than was asked for
 
 
 def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, float, float]) -> list[int]:
-    """brax's PPO replaced by evaluations (step, success, reward, a weight of the actor); which of them ran."""
+    """brax's PPO replaced by evaluations (step, success, reward, a weight of the actor); returns those that ran."""
     from droid_jax.policy import train as module
 
     ran = list[int]()
@@ -129,8 +129,8 @@ def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, floa
 MADE_UP: Any = SimpleNamespace(task=SimpleNamespace(steps=10), interface=None)
 
 
-def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: pytest.MonkeyPatch):
-    """Success counts first, then reward; what was not trained yet had the highest reward of those without success."""
+def test_the_best_trained_policy_is_kept(monkeypatch: pytest.MonkeyPatch):
+    """Success counts first, then reward.  The untrained policy has the highest reward of those without success."""
     played(monkeypatch, (0, 0.0, 900.0, 0.0), (100, 0.0, 5.0, 1.0), (200, 0.0, 8.0, 2.0), (300, 0.0, 7.0, 3.0))
     found = _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
     assert found.policy == 2.0
@@ -138,12 +138,12 @@ def test_the_best_policy_is_kept_and_the_untrained_one_is_no_rival(monkeypatch: 
 
 
 def test_the_rate_counts_the_evaluations_too(monkeypatch: pytest.MonkeyPatch):
-    """The time left was that of the training alone, as brax gives it."""
+    """brax's own rate leaves them out."""
     played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.0, 5.0, 1.0), (300, 0.0, 8.0, 2.0))
     clock = iter([2.0, 12.0, 32.0, 52.0])
     monkeypatch.setattr("droid_jax.policy.train.time", SimpleNamespace(monotonic=lambda: next(clock)))
     found = _brax(MADE_UP, None, replace(SHORT, steps=400), None, 0, lambda now: None, lambda step, tree: None)
-    assert [(now.rate, now.left) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
+    assert [(now.rate, now.remaining) for now in found.history] == [(0.0, float("inf")), (5.0, 60.0), (10.0, 10.0)]
 
 
 @pytest.mark.parametrize("evaluations", [2, 8, 16])
@@ -157,7 +157,7 @@ def test_a_run_that_was_stopped_has_as_many_evaluations_as_one_that_was_not(eval
 
 @pytest.mark.parametrize(("asked", "rounds"), [(20_000, 5), (70_000, 18), (4_000_000, 15 * 66)])
 def test_actions_are_rounded_up_to_whole_rounds(asked: int, rounds: int):
-    """A round for each of 15 evaluations were three times 20,000 actions; and a resumed run ended earlier."""
+    """Also in a run that continues."""
     config = TrainConfig(steps=asked)
     one = config.batch * config.minibatches * config.unroll
     parts = evaluations_left(config, asked) - 1
@@ -167,11 +167,11 @@ def test_actions_are_rounded_up_to_whole_rounds(asked: int, rounds: int):
 
 
 @pytest.mark.parametrize("preset", PRESETS.values())
-def test_presets_have_the_evaluations_that_they_say(preset: TrainConfig):
+def test_presets_have_their_number_of_evaluations(preset: TrainConfig):
     assert evaluations_left(preset, preset.steps) == preset.evaluations
 
 
-def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkeypatch: pytest.MonkeyPatch):
+def test_nan_weights_end_the_training_and_the_best_policy_is_kept(monkeypatch: pytest.MonkeyPatch):
     untrained, good, none = (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0), (200, 0.0, np.nan, np.nan)
     ran = played(monkeypatch, untrained, good, none, (300, 1.0, 1.0, 3.0))
     saved = list[int]()
@@ -182,7 +182,7 @@ def test_networks_that_are_no_numbers_end_the_training_and_the_best_stays(monkey
         _brax(MADE_UP, None, SHORT, None, 0, lambda now: None, lambda step, tree: None)
 
 
-def test_training_ends_once_success_has_held(monkeypatch: pytest.MonkeyPatch):
+def test_training_ends_after_repeated_success(monkeypatch: pytest.MonkeyPatch):
     config = replace(SHORT, steps=1000, enough=0.98, held=2)
     good = [(100, 0.99, 1.0, 1.0), (200, 0.97, 1.0, 2.0), (300, 0.98, 1.0, 3.0), (400, 1.0, 1.0, 4.0)]
     ran = played(monkeypatch, (0, 0.0, 0.0, 0.0), *good, (500, 1.0, 9.0, 5.0))
@@ -200,7 +200,7 @@ def test_training_ends_once_success_has_held(monkeypatch: pytest.MonkeyPatch):
 
 
 def made_up(scene: str = "one", effects: tuple[str, ...] = ()) -> Any:
-    """An environment as `train` reads it."""
+    """An environment with the attributes that `train` uses."""
     own = SimpleNamespace(name="door", sha256=scene)
     named = tuple(SimpleNamespace(name=e) for e in effects)
     return SimpleNamespace(task=Task(steps=10), interface=None, scene=own, start=np.zeros(2), effects=named)
@@ -214,7 +214,7 @@ def made_up(scene: str = "one", effects: tuple[str, ...] = ()) -> Any:
         (made_up(), replace(SHORT, hidden=(4, 4)), "config"),
     ],
 )
-def test_a_checkpoint_of_something_else_is_refused(monkeypatch, tmp_path: Path, env, config: TrainConfig, differs: str):
+def test_a_checkpoint_of_another_run_is_refused(monkeypatch, tmp_path: Path, env, config: TrainConfig, differs: str):
     played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0))
     train(made_up(), None, SHORT, checkpoints=tmp_path)
     with pytest.raises(ValueError, match=f"belongs to another run: it differs in {differs}"):
@@ -223,7 +223,7 @@ def test_a_checkpoint_of_something_else_is_refused(monkeypatch, tmp_path: Path, 
 
 # orbax leaves cancelled reads behind when a file is damaged; their complaint is not ours
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_damaged_checkpoint_is_passed_over_and_training_goes_on_from_the_one_before(monkeypatch, tmp_path: Path):
+def test_training_continues_from_the_last_valid_checkpoint(monkeypatch, tmp_path: Path):
     blank = ({"mean": np.zeros(2)}, {"w": np.zeros(2)}, {"v": np.zeros(1)})
     monkeypatch.setattr("droid_jax.policy.train._blank", lambda env, config: blank)
     played(monkeypatch, (0, 0.0, 0.0, 0.0), (100, 0.5, 5.0, 1.0), (200, 0.6, 6.0, 2.0))
@@ -238,7 +238,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_training_goes_on_from_the_one_b
 
 
 @pytest.mark.slow
-def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
+def test_a_short_run_is_saved_and_continues(tmp_path: Path):
     scene = door_scene(timestep=0.004, limits=True)
     env, randomise = DoorEnv(scene, Task(steps=20)), randomised(scene, prior(door_space(scene)))
     first = train(env, randomise, SHORT, checkpoints=tmp_path)
@@ -256,8 +256,8 @@ def test_a_short_run_is_kept_and_goes_on(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_door_that_blows_up_is_counted_and_training_goes_on():
-    """The first door is pushed open without end: its episodes end at once, the others' and the networks go on."""
+def test_a_diverging_environment_is_counted_and_training_continues():
+    """The first door diverges: its episodes end at once, those of the others continue."""
     scene = door_scene(timestep=0.004, limits=True)
     usual, hinge = randomised(scene, prior(door_space(scene))), scene.dof("hinge")
 

@@ -1,4 +1,4 @@
-"""Batches over blocks and devices: any number of rows, in order, the same as one by one."""
+"""Batches over blocks and devices: any number of rows, in order, equal to single rows."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_any_number_of_rows_equals_row_by_row(batch, rows: int):
             np.testing.assert_allclose(got[name][i], expected, rtol=1e-5, atol=1e-6, err_msg=f"{name} of row {i}")
 
 
-def test_rows_do_not_depend_on_their_company(batch):
+def test_a_row_does_not_depend_on_the_others(batch):
     values = np.random.default_rng(0).normal(size=(70, 5))
     order = np.random.default_rng(1).permutation(70)
     together, mixed = batch(values)["chain"], batch(values[order])["chain"]
@@ -43,7 +43,7 @@ def test_rows_do_not_depend_on_their_company(batch):
     np.testing.assert_array_equal(batch(values[40:41])["chain"], together[40:41])
 
 
-def test_a_nan_row_stays_alone(batch):
+def test_a_nan_row_does_not_affect_others(batch):
     values = np.ones((5, 5))
     values[3] = np.nan
     assert np.isnan(batch(values)["sum"]).tolist() == [False, False, False, True, False]
@@ -60,7 +60,7 @@ def test_blocks_cover_the_rows_once_and_repeat_the_last():
     assert (last[count:] == last[count - 1]).all()
 
 
-def test_whole_large_blocks_are_taken_where_they_fill_and_give_the_same(batch):
+def test_large_blocks_are_used_for_multiples_of_their_size_and_give_the_same(batch):
     values = np.random.default_rng(0).normal(size=(2 * LARGE_BLOCK, 5))
     assert [len(block) for block, _ in blocks(values)] == [LARGE_BLOCK, LARGE_BLOCK]
     assert {len(block) for block, _ in blocks(values[1:])} == {block_size(1)}
@@ -68,7 +68,7 @@ def test_whole_large_blocks_are_taken_where_they_fill_and_give_the_same(batch):
     np.testing.assert_allclose(large[1:], small, rtol=1e-5)
 
 
-def test_where_rows_are_always_many_a_cpus_block_is_larger():
+def test_programs_with_large_batches_have_larger_blocks_on_a_cpu():
     assert block_size(45) == block_size(4500) < block_size(45, many=True) == block_size(4500, many=True)
     assert block_size(45, many=True) % runtime.devices_mesh().size == 0
 

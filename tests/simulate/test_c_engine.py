@@ -1,4 +1,4 @@
-"""The batch of C rollouts against mj_step, and the instrumented model against the scene's own."""
+"""The batch of C rollouts against mj_step, and the instrumented model against the scene's."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def trace(scene: Scene, models: list[mujoco.MjModel], control: np.ndarray, start
     return simulate(scene, models, start, control)
 
 
-def test_a_torque_holds_the_weight_that_nothing_but_the_motors_carries():
-    """No compensation, one outside the motors, and one by them (actuatorgravcomp)."""
+def test_actuator_torques_contain_the_weight_that_nothing_else_compensates():
+    """Without compensation, with gravcomp, and with actuatorgravcomp."""
     xml = """<mujoco><worldbody><body {body}><joint name="j" axis="0 1 0" {joint}/><geom size=".1" pos=".3 0 0"/></body>
     </worldbody><actuator><position joint="j" kp="9"/></actuator></mujoco>"""
     lifted, own = 'gravcomp="1"', 'actuatorgravcomp="true"'
@@ -59,7 +59,7 @@ def test_a_torque_holds_the_weight_that_nothing_but_the_motors_carries():
         assert not _carries_weight(with_options(scene, gravity=[0.0, 0.0, 0.0]))
 
 
-def test_no_more_threads_than_this_process_may_use(
+def test_threads_are_limited_to_the_cores_of_the_process(
     scene: Scene, models: list[mujoco.MjModel], control: np.ndarray, start: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ):
     asked, own = [], engine.rollout.Rollout
@@ -70,7 +70,7 @@ def test_no_more_threads_than_this_process_may_use(
 
 
 def stepped(scene: Scene, model: mujoco.MjModel, qpos: np.ndarray, control: np.ndarray) -> dict[str, np.ndarray]:
-    """The same by hand, contacts read from the contact list."""
+    """The same by mj_step, with contacts read from the contact list."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     geoms = [[{int(model.pair_geom1[i]), int(model.pair_geom2[i])} for i in f] for f in scene.finger_pairs]
@@ -125,8 +125,8 @@ def test_each_row_can_have_its_own_start_and_command(
     assert np.abs(both.torque[1] - both.torque[0]).max() > 1.0
 
 
-def test_instrumenting_keeps_the_scenes_own_numbers():
-    """Options and fields changed after compilation stay, and nothing is added to the dynamics."""
+def test_instrumenting_keeps_the_scenes_numbers():
+    """Options and fields that were changed after compilation are kept, and the dynamics are unchanged."""
     scene = with_options(
         door_scene(springs=1), timestep=0.0005, integrator=mujoco.mjtIntegrator.mjINT_EULER, gravity=[0.0, 0.1, -9.7]
     )
@@ -149,8 +149,8 @@ def test_instrumenting_keeps_the_scenes_own_numbers():
     assert model.stat.meaninertia == scene.model.stat.meaninertia
 
 
-def test_a_rollout_that_blows_up_is_not_finite(scene: Scene, models: list[mujoco.MjModel], start: np.ndarray):
-    """MuJoCo's batch would repeat the last good state for the rest of the motion."""
+def test_a_rollout_that_diverges_is_not_finite(scene: Scene, models: list[mujoco.MjModel], start: np.ndarray):
+    """MuJoCo's batch repeats the last valid state for the rest of the motion."""
     wild = models[0].__copy__()
     wild.dof_damping[scene.joint_dofs] = -3000.0
     control = np.tile(start[:, None, :9] * 0, (1, 200, 1))

@@ -14,7 +14,7 @@ from droid_jax.model.scene import Scene, compile_scene, load_scene
 from droid_jax.preflight.preflight import closed_loop
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.closed_loops import OPEN, open_loops
-from droid_jax.simulate.inverse_dynamics import prescribed
+from droid_jax.simulate.inverse_dynamics import prescribed_joints
 from droid_jax.simulate.replay import make_drive
 
 TIME = np.arange(0.0, 1.0, 0.01)
@@ -51,7 +51,7 @@ def recording(joints: tuple[str, ...] = ("crank",), start: float = 0.0, **change
 
 
 @pytest.mark.parametrize("start", [0.0, 0.6, -0.5, 1.2])
-def test_a_loop_that_is_open_where_the_motion_starts_is_closed_by_its_passive_joints(start: float):
+def test_passive_joints_close_a_loop_at_the_start(start: float):
     scene = four_bar()
     drive = make_drive(scene, recording(start=start))
     assert drive.qpos0[scene.qpos("crank")] == start
@@ -69,8 +69,8 @@ def test_a_loop_that_is_open_where_the_motion_starts_is_closed_by_its_passive_jo
         assert closed_loop(scene, recording(start=start)) == ""
 
 
-def test_a_linkage_stays_on_the_branch_that_the_scene_is_on():
-    """A rocker can close the loop in two ways: the one that a slow turn of the crank leads to is taken."""
+def test_a_linkage_stays_on_the_branch_of_the_scene():
+    """A rocker can close the loop in two ways.  The expected one is reached by a slow turn of the crank."""
     scene = four_bar()
     pose = make_drive(scene, recording(start=0.6)).qpos0
     for small in np.linspace(0.0, 0.6, 7):
@@ -89,7 +89,7 @@ def test_a_linkage_stays_on_the_branch_that_the_scene_is_on():
     ],
 )
 def test_a_loop_that_nothing_can_close_is_refused_with_the_distance(equality: str, says: str):
-    """All joints are stated, so that none is free to move."""
+    """All joints are stated, so none is free to move."""
     stated = recording(start=0.6, qpos0={"crank": 0.6, "coupler": 0.0, "rocker": 0.0})
     with pytest.raises(
         ValueError, match=rf"recording 'turn' starts where {says} of scene 'four-bar' is open by 0\.\d+"
@@ -102,16 +102,16 @@ def test_a_loop_out_of_reach_is_refused():
         make_drive(four_bar(CONNECT.replace(".15", ".05")), recording(start=1.6))
 
 
-def test_a_loop_that_is_switched_off_is_none():
+def test_an_inactive_equality_is_ignored():
     assert not open_loops(four_bar(CONNECT.replace("/>", ' active="false"/>')), np.array([0.6, 0.0, 0.0]))
 
 
-def test_encoders_of_a_loop_may_disagree_a_little():
+def test_encoders_of_a_loop_may_have_small_errors():
     stated = recording(start=0.0, qpos0={"crank": 0.01, "coupler": 0.0, "rocker": 0.0})
     assert 0 < open_loops(four_bar(), make_drive(four_bar(), stated).qpos0)[0].turn < OPEN
 
 
-def test_a_log_without_commands_warns_of_a_loop_that_it_leaves_out():
+def test_a_log_without_commands_warns_of_a_loop_that_it_ignores():
     position = Channel(
         "position", "rad", ("crank",), TIME, 0.1 * np.sin(TIME)[None, :, None], np.ones((1, 100, 1), bool)
     )
@@ -119,11 +119,11 @@ def test_a_log_without_commands_warns_of_a_loop_that_it_leaves_out():
     log = recording(
         joints=(), command=np.zeros((0, 0)), time=np.zeros(0), channels={"torque": torque, "position": position}
     )
-    with pytest.warns(UserWarning, match=r"a prescribed motion leaves <connect> 'pin' of scene 'four-bar' out"):
-        assert prescribed(four_bar(), log) == ("crank",)
+    with pytest.warns(UserWarning, match=r"the replay ignores <connect> 'pin' of scene 'four-bar'"):
+        assert prescribed_joints(four_bar(), log) == ("crank",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        prescribed(four_bar('<joint joint1="rocker" joint2="coupler"/>'), log)
+        prescribed_joints(four_bar('<joint joint1="rocker" joint2="coupler"/>'), log)
 
 
 # ----- floating bases
@@ -156,11 +156,11 @@ def test_a_floating_base_that_nothing_holds_is_refused(scene: dict, says: str):
         make_drive(leg(**scene), recording())
 
 
-def test_a_base_in_balance_is_held_by_nothing_either():
-    """Its centre is in the joint: it stands, until the first command turns it."""
+def test_a_balanced_base_is_refused_too():
+    """Its centre of mass is at the joint, so it stands still until a command turns it."""
     scene = leg(joint='<joint name="socket" type="ball" damping="1"/>')
     scene.model.opt.gravity[:] = 0
-    with pytest.raises(ValueError, match=r"the ball joint socket.* whatever the commands do moves it"):
+    with pytest.raises(ValueError, match=r"the ball joint socket.* every command moves it"):
         make_drive(scene, recording())
 
 
@@ -178,8 +178,8 @@ def test_a_base_that_something_holds_is_replayed(scene: dict):
     make_drive(leg(**scene), recording())
 
 
-def test_a_thing_that_floats_and_carries_nothing_is_no_base():
-    """What is manipulated may be free."""
+def test_a_floating_object_without_measured_joints_is_no_base():
+    """A manipulated object may be free."""
     xml = FOUR_BAR.format(equality="", more="", coupler="").replace(
         "</worldbody>", '<body pos="1 0 1"><freejoint/><geom size=".1"/></body></worldbody>'
     )
@@ -187,7 +187,7 @@ def test_a_thing_that_floats_and_carries_nothing_is_no_base():
 
 
 def test_a_urdf_without_servos_says_where_to_add_them(tmp_path: Path):
-    """What became of its mimic joint is said too."""
+    """The message also mentions the equality of its mimic joint."""
     inertia = '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>'
     link = f'<link name="{{0}}"><inertial><mass value="1"/>{inertia}</inertial></link>'
     joint = (
@@ -198,6 +198,6 @@ def test_a_urdf_without_servos_says_where_to_add_them(tmp_path: Path):
     parts += [joint.format("crank", "base", "a", ""), joint.format("finger", "a", "b", '<mimic joint="crank"/>')]
     file = tmp_path / "arm.urdf"
     file.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
-    said = "a URDF holds none: save it as MJCF and add them there; its 1 <mimic> became"
+    said = "a URDF has none: save it as MJCF and add them there; its 1 <mimic> became"
     with pytest.raises(ValueError, match=said):
         make_drive(load_scene(file, joints=["crank"]), recording())

@@ -1,4 +1,4 @@
-"""One compiled program for all replays that differ in numbers alone; a loop over steps, alone and in a batch."""
+"""One compiled program for replays that differ in numbers only; a time loop, alone and in a batch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueSide
 from droid_jax.simulate import compiled
 from droid_jax.simulate.batching import time_loop
-from droid_jax.simulate.replay import TORQUE_OFFSETS, make_drive, sensed, servo_replay
+from droid_jax.simulate.replay import TORQUE_OFFSETS, make_drive, servo_replay, with_sensor_model
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def space_of(scene: Scene, high: float = 9.0) -> Space:
 
 
 def pull(size: float, traced: list[float]) -> Effect:
-    """A constant torque, which notes each time that its program is traced."""
+    """A constant torque that counts the traces of its program."""
 
     def force(theta, state):
         traced.append(size)
@@ -56,7 +56,7 @@ def torque(cost: Cost) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def base(scene: Scene) -> tuple[Effect, list[float], np.ndarray]:
-    """An effect, when its program is traced, and the torque that it gives: compiled once for all tests."""
+    """An effect that counts the traces of its program, and the torque that it gives; compiled once for all tests."""
     traced = list[float]()
     effect = pull(0.0, traced)
     return effect, traced, torque(made(scene, recording(), effect))
@@ -65,14 +65,14 @@ def base(scene: Scene) -> tuple[Effect, list[float], np.ndarray]:
 def test_other_commands_starts_and_bounds_share_a_program(
     scene: Scene, base: tuple[Effect, list[float], np.ndarray], monkeypatch: pytest.MonkeyPatch
 ):
-    """And another effect has one of its own: here as long as the motion alone needs, which changes no replay."""
+    """Another effect has its own program, here of the length of the motion, which changes no replay."""
     effect, traced, first = base
     count, command = len(traced), motion()[1]
     slower = recording(name="slower", command=0.5 * command + 0.5 * command[0])
     other = torque(made(scene, slower, effect, high=5.0))
     assert count and len(traced) == count
     assert np.abs(other - first).max() > 0.1
-    monkeypatch.setattr(compiled, "SHORTEST", 1)
+    monkeypatch.setattr(compiled, "MIN_ROWS", 1)
     assert compiled.capacity(1024) == 1024 and compiled.capacity(1025) == 2048
     own = list[float]()
     alone = torque(made(scene, slower, pull(0.0, own)))
@@ -110,7 +110,7 @@ def test_other_lengths_share_a_program_and_are_replayed_to_their_own_end(
 
 
 def summed(traced: list[int]) -> Any:
-    """steps of x + rate * k from a start, which notes each time that its step is traced."""
+    """`steps` steps of x + rate * k from a start; counts the traces of its step."""
 
     def step(sample: Any, k: jax.Array, state: jax.Array) -> jax.Array:
         traced.append(1)
@@ -123,15 +123,15 @@ def summed(traced: list[int]) -> Any:
 RATES = jnp.array([1.0, -0.5, 3.0])
 
 
-def test_sensors_see_the_friction_behind_them_before_they_err(scene: Scene):
-    """Coulomb friction is part of the torque that another gain scales and neighbours read: it was added afterwards."""
+def test_sensor_friction_is_added_before_sensor_errors(scene: Scene):
+    """A gain error scales, and crosstalk reads, a torque that contains Coulomb friction."""
     effects, base = library(scene, ["torque_crosstalk"]), joint_friction_space(scene.joints)
     made_with = compiled.with_sensors(scene, base, make_drive(scene, recording()), effects)
     assert {e.name for e in made_with} == {"joint friction", "torque_crosstalk", TORQUE_OFFSETS}
     theta = {"coulomb[shoulder]": 2.0, "crosstalk_before[elbow]": 0.25, "torque_offset[shoulder]": 8.0}
     still = jnp.zeros((5, 2))
     motion = Rollout(still[:, 0], still, still, still + 1.0, still[:, 0], still[:, :0], jnp.array(True))
-    seen = sensed(motion, {n: jnp.float32(v) for n, v in theta.items()}, made_with, 0.002)
+    seen = with_sensor_model(motion, {n: jnp.float32(v) for n, v in theta.items()}, made_with, 0.002)
     np.testing.assert_allclose(seen.torque, np.tile([10.0, 0.5], (5, 1)))
 
 
@@ -145,14 +145,14 @@ def test_a_batch_is_its_rows_and_traces_a_step_twice():
     np.testing.assert_array_equal(batch, jnp.stack(alone))
 
 
-def test_starts_of_their_own_and_no_steps():
+def test_different_starts_and_zero_steps():
     loop, starts = summed([]), jnp.array([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(jax.vmap(lambda r, s: loop(r, s, 0))(RATES, starts), starts)
     np.testing.assert_array_equal(jax.vmap(lambda r, s: loop(r, s, 2))(RATES, starts), starts + RATES + 4.0)
 
 
 def test_a_loop_has_forward_derivatives():
-    """jax.jacfwd raised: its rows differ in their tangents, and the loop called its unbatched result a batch."""
+    """In jax.jacfwd rows differ in their tangents only, and the loop's primal is not batched."""
 
     def ended(x: jax.Array) -> jax.Array:
         return time_loop(lambda rate, k, now: now * rate, x[0], x[1], 3)  # x1 x0^3
@@ -164,7 +164,7 @@ def test_a_loop_has_forward_derivatives():
 
 @pytest.mark.slow
 def test_the_documented_replay_has_forward_derivatives():
-    """docs/your-robot.md: of positions by a damping against differences, and of torques by an offset: it is read."""
+    """The example of docs/your-robot.md: positions by a damping against differences, and torques by an offset."""
     scene = pendulum()
     space = Space((joint_damping(scene, "swing", std=0.05, high=1.0), *torque_offsets(scene.joints)))
     drive = make_drive(scene, swung("a", 1.0, 0.7))

@@ -1,4 +1,4 @@
-"""The whole door demonstration: MJX against the C engine, step by step and against a fine step."""
+"""The whole door demonstration: MJX against the C engine, with equal steps and with fine steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Channel, Recording
-from droid_jax.simulate import c_reference as twin
+from droid_jax.simulate import c_reference
 from droid_jax.simulate.batching import over_population
 from droid_jax.simulate.c_engine import Trace, instrument, simulate
 from droid_jax.simulate.c_reference import c_replay
@@ -66,7 +66,7 @@ def in_c(scene: Scene, space: Space, drive: Drive, rows: np.ndarray) -> Rollout:
 
 @pytest.fixture(scope="module")
 def both(scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout) -> tuple[Rollout, Rollout]:
-    """MJX and C.  The program compiles for half a minute: quick tests of the door in MJX are in test_door_env.py."""
+    """MJX and C.  The program compiles for half a minute, so quick tests of the door in MJX are in test_door_env.py."""
     return replayed(scene, space, drive, rows, parity=True), in_c
 
 
@@ -76,14 +76,14 @@ def rms(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def test_the_doors_open(in_c: Rollout):
-    """Otherwise the comparisons below would compare two arms in the air."""
+    """The comparisons below need a motion that opens the door."""
     assert (np.rad2deg(in_c.object_angle.max(axis=1)) > 45).all()
     assert in_c.contact[:, -1].all()
 
 
 @pytest.mark.slow
 def test_torques_are_those_of_the_c_engine(both: tuple[Rollout, Rollout]):
-    """Through grasp and opening: float32 against float64 (0.0015 N m over 7.7 s when this was written)."""
+    """Through grasp and opening, float32 against float64; the difference is about 0.0015 N m over 7.7 s."""
     in_mjx, in_c = both
     assert in_mjx.torque.shape == in_c.torque.shape
     off = rms(in_mjx.torque, in_c.torque)
@@ -102,7 +102,7 @@ def test_motion_and_contacts_are_those_of_the_c_engine(both: tuple[Rollout, Roll
 
 
 def test_different_doors_give_different_torques(in_c: Rollout):
-    """The tolerance above is a hundredth of what the method looks for."""
+    """The tolerance above is a hundredth of the differences between doors."""
     for other in in_c.torque[1:]:
         assert np.sqrt(np.mean((other - in_c.torque[0]) ** 2)) > 0.1
 
@@ -124,11 +124,11 @@ def fine(scene: Scene, demonstration: Recording, space: Space, rows: np.ndarray)
     return Trace(*(getattr(trace, f)[:, ::20] for f in Trace.__dataclass_fields__))
 
 
-def test_half_a_step_of_delay_serves_the_c_engine_in_free_motion(
+def test_half_a_step_of_delay_halves_the_error_of_the_c_engine(
     scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout, fine: Trace, monkeypatch
 ):
-    """Up to the grasp its error falls by more than half; after it, the contact's own error is larger."""
-    monkeypatch.setattr(twin, "control_of", lambda drive, command, offset, late: command)
+    """Before the grasp its error decreases by more than half; afterwards the contact's error is larger."""
+    monkeypatch.setattr(c_reference, "control_of", lambda drive, command, offset, late: command)
     plain = c_replay(scene, space, drive)(rows[:1])
     free = slice(0, 700)
     with_delay = rms(in_c.torque[:1, free], fine.torque[:1, free])
@@ -141,7 +141,7 @@ def test_half_a_step_of_delay_serves_the_c_engine_in_free_motion(
 def test_the_replay_at_2_ms_agrees_with_c_at_a_tenth(
     scene: Scene, space: Space, drive: Drive, rows: np.ndarray, in_c: Rollout, fine: Trace
 ):
-    """The second-order step: ten times closer than C's own 2 ms (0.0016 against 0.022 N m when written)."""
+    """The second-order step is ten times closer than C's 2 ms (0.0016 against 0.022 N m)."""
     got = replayed(scene, space, drive, rows[:4], parity=False)
     off = rms(got.torque, fine.torque)
     assert off.max() < 0.006, off.round(4)
@@ -180,10 +180,10 @@ def test_both_engines_rank_samples_alike(scene: Scene, demonstration: Recording,
 
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_the_replay_moves_smoothly_with_the_grip(space: Space, demonstration: Recording, engine: str):
-    """No cliffs: a touch that moves to the next time step must not change all that follows.
+    """A touch that moves to the next time step must not change the following motion.
 
-    With a contact that is hard from the first touch, the largest step along this line is three times the median
-    one; here it is 1.3 times, in either engine.
+    With a contact that is hard from the first touch, the largest step along this line is three times the median one;
+    here it is 1.3 times, in both engines.
     """
     scene = door_scene(timestep=0.004)
     drive = make_drive(scene, demonstration)

@@ -1,4 +1,4 @@
-"""Which engine a fit takes."""
+"""The choice of the engine of a fit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_log_of_one_repeat_is_replayed_in_c():
         (replace(ONE, time=np.zeros(0), command=np.zeros((0, 0)), command_names=()), "inverse dynamics"),
     ],
 )
-def test_what_c_lacks_is_replayed_in_mjx(given: Recording, why: str):
+def test_features_that_c_lacks_are_replayed_in_mjx(given: Recording, why: str):
     choice = choose_engine(arm(), SPACE, [ONE, given])
     assert choice.engine == "mjx" and why in choice.why
 
@@ -53,7 +53,7 @@ def test_other_machines_are_mjx(monkeypatch: pytest.MonkeyPatch):
     assert choose_engine(arm(), SPACE, [ONE]).engine == "mjx"
 
 
-def test_a_gpu_takes_what_is_too_much_for_the_cores_beside_it(monkeypatch: pytest.MonkeyPatch):
+def test_a_gpu_replays_batches_that_are_large_for_the_cpu(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(runtime, "cores", lambda: 4)
     few, many = (choose_engine(arm(), SPACE, [ONE], samples=samples) for samples in (64, 65))
@@ -61,8 +61,8 @@ def test_a_gpu_takes_what_is_too_much_for_the_cores_beside_it(monkeypatch: pytes
     assert choose_engine(arm(), SPACE, [recording()], samples=1).engine == "mjx"
 
 
-def test_c_draws_a_servos_own_profile():
-    """Both engines replay a goal whose acceleration is limited; MJX is the reference."""
+def test_c_supports_servo_profiles():
+    """Both engines replay a goal with limited acceleration; MJX is the reference."""
     scene = arm()
     effects = library(scene, ["profile_acceleration"])
     space = SPACE + effect_space(effects)

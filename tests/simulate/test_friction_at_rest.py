@@ -1,4 +1,4 @@
-"""Friction at rest: bounded, not known from the speed; against closed forms and an exact integrator."""
+"""Set-valued friction at rest, against closed forms and an exact integrator."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def hinge(loss: float = LOSS) -> Scene:
 
 
 def held(measured: float, side: TorqueSide = MOTOR, **changes: object) -> Motion:
-    """Standing still at the horizontal while `measured` N m are measured."""
+    """A joint at rest in the horizontal pose, with a measured torque of `measured` N m."""
     still = np.zeros((4, 1))
     motion = Motion(
         joints=("j",), time=0.01 * np.arange(4), position=still, velocity=still, acceleration=still,
@@ -55,7 +55,7 @@ def replay_of(scene: Scene, convention: TorqueConvention, effects: tuple[Effect,
 
 
 def torque(scene: Scene, motion: Motion, effects: tuple[Effect, ...] = (), **theta: float) -> float:
-    """N m, the replayed torque of the first row; theta: coulomb."""
+    """N m, replayed torque of the first row; theta: coulomb."""
     space = Space((joint_frictionloss(scene, "j", std=0.1, high=1.0),)) + joint_friction_space(("j",))
     values = space.values({f"{name}[j]": value for name, value in theta.items()})
     physics = make_physics(scene, space, np.asarray(values, np.float32))
@@ -74,23 +74,23 @@ def torque(scene: Scene, motion: Motion, effects: tuple[Effect, ...] = (), **the
         (WEIGHT - 0.5, WEIGHT - LOSS),
     ],
 )
-def test_at_rest_what_friction_cannot_hold_is_left(measured: float, expected: float):
+def test_the_residual_at_rest_is_the_distance_to_the_interval(measured: float, expected: float):
     assert torque(hinge(), held(measured)) == pytest.approx(expected, abs=1e-5)
 
 
-def test_noise_may_leave_the_interval_by_its_slack():
+def test_noise_within_the_slack_gives_no_residual():
     slack = {"torque_slack": np.array([0.03]), "acceleration_slack": np.array([0.04 / 0.05])}  # inertia 0.05 kg m^2
     assert torque(hinge(), held(WEIGHT + 0.5, **slack)) == pytest.approx(WEIGHT + LOSS + 0.05, abs=1e-5)
 
 
-def test_friction_behind_the_sensor_is_bounded_too():
+def test_sensor_friction_is_set_valued_too():
     effects = (joint_friction_effect(("j",), jnp.sign),)
     on_link = held(WEIGHT + 0.2, LINK)
     assert torque(hinge(), on_link, effects, coulomb=0.25) == pytest.approx(WEIGHT + 0.2, abs=1e-5)
     assert torque(hinge(), on_link, effects, coulomb=0.15) == pytest.approx(WEIGHT + 0.15, abs=1e-5)
 
 
-def test_a_joint_without_friction_is_compared_with_its_weight():
+def test_a_joint_without_friction_has_no_interval():
     scene = hinge(0.0)
     path = motion_path(scene, held(WEIGHT + 0.2))
     replay = replay_of(scene, TorqueConvention(MOTOR, True), ())
@@ -99,7 +99,7 @@ def test_a_joint_without_friction_is_compared_with_its_weight():
     assert float(replay(physics, path).torque[0, 0]) == pytest.approx(WEIGHT, abs=1e-5)
 
 
-def test_a_moving_joint_keeps_its_law():
+def test_a_moving_joint_has_coulomb_friction():
     speed = np.full((4, 1), 0.5)
     moving = held(WEIGHT, rest=np.zeros((4, 1), bool), velocity=speed)
     assert torque(hinge(), moving) == pytest.approx(WEIGHT + LOSS, abs=1e-5)
@@ -133,8 +133,8 @@ def test_which_samples_are_at_rest():
     assert noisy.all()
 
 
-def test_the_exact_integrator_holds_what_friction_can_hold():
-    """A load of 0.05 N m below a friction of 0.1 N m moves nothing; MuJoCo's soft friction would creep."""
+def test_the_exact_integrator_does_not_creep():
+    """A load 0.05 N m below a friction of 0.1 N m moves nothing, whereas MuJoCo's soft friction creeps."""
     position, force = exact(Truth(0.05, 0.1, 0.01), np.full(5000, 0.05 / 8.0))
     assert np.ptp(position[2500:]) == 0.0
     assert abs(force[-1] - 0.5 * 9.81 * 0.1 * np.sin(position[-1])) < 0.1
@@ -143,7 +143,7 @@ def test_the_exact_integrator_holds_what_friction_can_hold():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_friction_and_damping_of_a_hinge_that_holds(seed: int):
-    """By exact integration (even) and by C MuJoCo (odd); before, sign(v) at rest pulled friction off by 10 %."""
+    """By exact integration (even seeds) and by C MuJoCo (odd).  With sign(v) at rest, friction is biased by 10 %."""
     scene, space = studied()
     recording, truth = recorded(seed, "a")
     assert truth == drawn(np.random.default_rng([seed, 0]))
@@ -158,7 +158,7 @@ def test_friction_and_damping_of_a_hinge_that_holds(seed: int):
 
 
 @pytest.mark.slow
-def test_what_is_left_at_rest_tells_nothing_of_noise():
+def test_residuals_at_rest_are_not_used_for_noise():
     scene, space = studied()
     recording, _ = recorded(2, "a")
     cost = make_cost(scene, space, [recording])

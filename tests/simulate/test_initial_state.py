@@ -1,4 +1,4 @@
-"""Where a motion starts, and what is said where that is a guess."""
+"""Initial poses of motions, and messages for uncertain ones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scene() -> Scene:
     return arm()
 
 
-def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_was_sent(scene: Scene):
+def test_the_start_is_stated_else_measured_else_commanded(scene: Scene):
     _, command = motion()
 
     def start(**changes) -> list[float]:
@@ -50,8 +50,7 @@ def test_a_motion_starts_where_it_says_else_where_it_was_measured_else_where_it_
 
 @pytest.mark.parametrize(("late", "jerky", "warned"), [(0.0, 0, False), (0.15, 0, True), (0.0, 1, False)])
 def test_a_recording_that_begins_in_motion_is_warned_of(scene: Scene, late: float, jerky: int, warned: bool):
-    """Cut where the robot moves, it is not what a replay from rest does; neither noise of the sensors is a motion, nor
-    a quick start from rest."""
+    """A replay starts at rest.  Sensor noise and a quick start from rest cause no warning."""
     time, _ = motion(2.0)
     swing = 0.4 * (1 - np.cos(2 * (time + late))) + jerky * 0.3 * np.clip(time / 0.1, 0, 1) ** 3
     path = np.stack([swing, np.full_like(time, -0.3)], axis=1)
@@ -87,7 +86,7 @@ def test_a_recording_made_in_python_is_checked_like_one_from_a_file(scene: Scene
 
 
 def test_a_parameter_that_nothing_reads_is_refused(scene: Scene):
-    """A slip in a name would be a parameter that no data tell, and nobody would know why."""
+    """A misspelled name would be a parameter that no data constrain."""
     wrong = Space((*SPACE.parameters, Parameter("torque_offset[elbo]", "N m", 0.0, 0.1, -1.0, 1.0)))
     with pytest.raises(ValueError, match=r"parameters torque_offset\[elbo\] write no field.*torque_offset\[elbow\]"):
         make_cost(scene, wrong, [recording()])
@@ -97,8 +96,8 @@ def test_a_parameter_that_nothing_reads_is_refused(scene: Scene):
 
 @pytest.mark.parametrize("limited", ["true", "false"])
 @pytest.mark.parametrize("measured", [False, True])
-def test_degrees_are_no_radians(measured: bool, limited: str):
-    """Whether the replay holds the joint within its range or not, as the built-in scenes do not."""
+def test_degrees_are_detected(measured: bool, limited: str):
+    """With and without a limit of the joint in the replay."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction=f'limited="{limited}" range="-2 2"', sensor="")
     scene = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
     fine = recording()
@@ -120,8 +119,8 @@ def test_normalised_positions_and_encoder_counts_are_named(scene: Scene):
         check_range(scene, counts)
 
 
-def test_a_little_outside_of_a_range_may_be_degrees_too(scene: Scene):
-    """Eight degrees are twice as far as an arm can reach that turns by four radians; a servo overshoots by less."""
+def test_degrees_slightly_outside_of_a_range_are_detected(scene: Scene):
+    """Eight degrees are twice the range of an arm that turns by four radians; a servo's overshoot is smaller."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction='range="-2 2"', sensor="")
     limited = compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
     fine = recording()
@@ -134,7 +133,7 @@ def test_a_little_outside_of_a_range_may_be_degrees_too(scene: Scene):
 
 
 @pytest.mark.parametrize("measured", [False, True])
-def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, measured: bool):
+def test_degrees_of_a_hinge_without_range_are_warned_of(scene: Scene, measured: bool):
     """A wheel may turn often, so it is a warning."""
     fine = recording()
     said = "elbow is measured at" if measured else "elbow is sent to"
@@ -146,28 +145,28 @@ def test_degrees_are_no_radians_of_a_hinge_without_a_range_either(scene: Scene, 
 
 
 def motors() -> Scene:
-    """The arm whose shoulder a motor drives, not a servo."""
+    """The arm with a motor, not a servo, at its shoulder."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="")
     xml = xml.replace('<position name="s" joint="shoulder" kp="60"/>', '<motor name="s" joint="shoulder"/>')
     return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
 
 
-def test_commands_of_an_actuator_without_position_feedback_are_said_to_be_torques(scene: Scene):
+def test_commands_without_position_feedback_are_called_torques(scene: Scene):
     said = "the actuators of shoulder have no position feedback: the commands of recording 'wave' are taken as"
     with pytest.warns(UserWarning, match=said):
         followed(motors(), recording(gains=None), CompareConfig())
     assert not open_loop(scene, recording())
 
 
-def test_a_start_that_would_be_a_guess_is_refused():
+def test_an_unknown_start_is_refused():
     driven = motors()
-    with pytest.raises(ValueError, match="does not tell where shoulder starts"):
+    with pytest.raises(ValueError, match="does not say where shoulder starts"):
         make_drive(driven, recording(qpos0={}, gains=None))
     started = make_drive(driven, recording(qpos0={}, gains=None, channels=measured(0.2)))
     np.testing.assert_allclose(started.qpos0, [0.25, 0.25])
 
 
-def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene: Scene):
+def test_an_object_starts_at_its_measured_angle_unless_within_noise(scene: Scene):
     spec = mujoco.MjSpec.from_string(ARM.format(gravcomp='gravcomp="1"', friction="", sensor=""))
     door = spec.worldbody.add_body(name="door", pos=[0, 2, 0])
     door.add_joint(name="hinge", axis=[0, 0, 1])
@@ -185,8 +184,8 @@ def test_an_object_starts_where_it_was_seen_unless_a_cameras_noise_is_all(scene:
     assert start(0.005) == 0.0 and start(0.4) == pytest.approx(0.4) and start(0.4, hinge=0.1) == 0.1
 
 
-def test_repeats_serve_a_door_that_is_seen_just_ajar():
-    """About `ajar` the mean of some repeats is put back to the scene's pose, and that of others is not."""
+def test_repeats_of_a_door_that_is_just_ajar_share_a_replay():
+    """Near `ajar` the mean of some repeats is set to the scene's pose, and that of others is not."""
     door, demonstration = door_scene(), load_recording(demonstration_path("A"))
     time = demonstration.time[::30]
 
@@ -212,8 +211,8 @@ COUPLED = """<mujoco><worldbody><body><joint name="shoulder" axis="0 1 0"/><geom
 
 
 @pytest.mark.parametrize("driver", ["elbow", "mimic"])
-def test_a_joint_that_follows_another_starts_where_that_has_it(driver: str):
-    """Else the replay begins with a constraint that is broken, and yanks the joints together."""
+def test_a_coupled_joint_starts_at_its_coupled_position(driver: str):
+    """Otherwise the replay begins with a violated constraint, which pulls the joints together."""
     first, second = ("mimic", "elbow") if driver == "elbow" else ("elbow", "mimic")
     scene = compile_scene(
         mujoco.MjSpec.from_string(COUPLED.format(first=first, second=second)), "coupled", joints=("shoulder", "elbow")
@@ -232,7 +231,7 @@ def test_a_joint_that_follows_another_starts_where_that_has_it(driver: str):
         make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": 0.4, "mimic": 0.3}, **heavy))
 
 
-def test_a_servo_with_a_gear_is_sent_its_control_and_that_is_said():
+def test_commands_of_a_servo_with_a_gear_are_controls_and_reported():
     spec = arm().spec.copy()
     for actuator in spec.actuators:
         actuator.gear[0] = 50.0
@@ -245,8 +244,8 @@ def test_a_servo_with_a_gear_is_sent_its_control_and_that_is_said():
     assert "shoulder 60 in place of 150000" in gains_note(scene, recording(gains=ServoGains(kp, np.zeros(2))))
 
 
-def test_coupled_joints_follow_the_scatter_of_what_has_them():
-    """Starts that differ by a milliradian differ by fifty in a rotor behind a gear: the same replay serves both."""
+def test_the_scatter_of_coupled_joints_is_allowed():
+    """Starts that differ by a milliradian differ by fifty at a rotor behind a gear; they share a replay."""
     text = (
         COUPLED.format(first="mimic", second="elbow").replace("0.05 -2 0 0 0", "0 50 0 0 0").replace("0 2 1 0 0", "0 1")
     )
@@ -260,7 +259,7 @@ def test_coupled_joints_follow_the_scatter_of_what_has_them():
 
 
 @pytest.mark.parametrize(("speed", "warned"), [(0.0, 0), (0.4, 1)])
-def test_a_slow_log_that_sets_off_from_rest_does_not_move_at_once(speed: float, warned: int):
+def test_a_slow_log_from_rest_is_no_log_in_motion(speed: float, warned: int):
     """At 50 Hz six rows are a tenth of a second, in which a servo reaches its speed."""
     time = np.arange(200) * 0.02
     path = speed * time + 0.4 * np.maximum(time - 0.02, 0.0) ** 2 / (0.05 + np.maximum(time - 0.02, 0.0))

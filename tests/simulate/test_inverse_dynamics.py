@@ -27,7 +27,7 @@ from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.model.step import gear_torques
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.compiled import compiled_replay
-from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed
+from droid_jax.simulate.inverse_dynamics import motion_path, path_replay, prescribed_joints
 from droid_jax.simulate.measured_motion import Motion
 from droid_jax.simulate.replay import Replay, torque_offset_effect
 
@@ -70,7 +70,7 @@ def replayed(scene: Scene, space: Space, values: np.ndarray, given: Motion, *eff
 
 
 def expected(model: mujoco.MjModel, scene: Scene, given: Motion) -> np.ndarray:
-    """[T, J] N m by mj_inverse, with the parts that the convention leaves out taken out of the model."""
+    """[T, J] N m by mj_inverse, with the parts that the convention excludes removed from the model."""
     model = model.__copy__()
     model.body_gravcomp[:] = 0
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -128,7 +128,7 @@ def planar(*, gravcomp: bool = True, spring: str = "", more: str = "", joints: S
 
 
 def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
-    """With a torque sensor whose zero is off: effects of sensors are applied."""
+    """With a torque offset: sensor effects are applied."""
     space = Space(torque_offsets(scene.joints))
     given, off = motion(scene, side, gravity), np.array([0.0, 0.3])
     values = space.values({"torque_offset[b]": off[1]})
@@ -145,21 +145,21 @@ def check_planar(scene: Scene, side: TorqueSide, gravity: bool) -> None:
         pytest.param(False, LINK, False, marks=pytest.mark.slow),
     ],
 )
-def test_gravity_is_the_recordings_choice_not_the_files(gravcomp: bool, side: TorqueSide, gravity: bool):
-    """Whether the MJCF compensates its weight must not change what a log is compared with."""
+def test_gravity_follows_the_recordings_convention(gravcomp: bool, side: TorqueSide, gravity: bool):
+    """The MJCF's gravity compensation must not change the compared torque."""
     check_planar(planar(gravcomp=gravcomp), side, gravity)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("side", [MOTOR, LINK])
-def test_springs_and_tendons_pull_on_either_side_and_dry_friction_on_the_motors(side: TorqueSide):
+def test_springs_act_on_both_sides_and_dry_friction_on_the_motor_side(side: TorqueSide):
     """A joint's spring, a tendon's, and a friction loss that opposes the motion."""
     check_planar(planar(spring='stiffness="5" springref="0.3" frictionloss="0.7"', more=TENDON), side, False)
 
 
 @pytest.mark.parametrize(("side", "gravity"), [(MOTOR, True), pytest.param(LINK, False, marks=pytest.mark.slow)])
 def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
-    """Masses, springs, tendons, friction at rest and what is behind the sensor, along two motions."""
+    """Masses, springs, tendons, friction at rest and sensor friction, along two motions."""
     scene = planar(spring='stiffness="5" springref="0.3" frictionloss="0.7"', more=TENDON)
     sensed = [
         sensor_parameter(scene.joints, term, "b", std=0.1, high=2.0)
@@ -188,11 +188,8 @@ def test_plain_c_follows_the_same_equation(side: TorqueSide, gravity: bool):
 
 
 @pytest.mark.parametrize("gravcomp", [True, False])
-def test_gears_carry_the_weight_that_a_torque_does_not_hold(gravcomp: bool):
-    """What motor and links put onto a gear is what a servo's replay has at the same moment, whatever the log is of.
-
-    Along a motion whose torque holds no weight, gears carried none.
-    """
+def test_gear_torques_contain_the_weight_for_both_conventions(gravcomp: bool):
+    """The gears' torques equal those of the servo replay at the same instant, for both gravity conventions."""
     scene = planar(gravcomp=gravcomp)
     data, rng = mujoco.MjData(scene.model), np.random.default_rng(4)
     data.qpos[:], data.qvel[:], data.ctrl[:] = rng.normal(0.0, 0.5, (3, 2))
@@ -214,14 +211,16 @@ def test_gears_carry_the_weight_that_a_torque_does_not_hold(gravcomp: bool):
     assert np.abs(servo[1]).max() > 1.0
 
 
-def test_plain_c_refuses_what_it_does_not_have():
+def test_plain_c_refuses_unsupported_effects():
     scene = planar()
     pull = Effect("pull", force=lambda theta, state: state.qvel)
     space = Space(torque_offsets(scene.joints))
     with pytest.raises(ValueError, match="effects depend on the state: pull; use MJX"):
         compiled_replay("mujoco", scene, space, motion(scene, LINK, True), [pull])
     turned = Space((joint_encoder_offset(scene, "a", std=0.1, high=0.5),))
-    with pytest.raises(ValueError, match="taken out where encoders say, not where joints are; use MJX"):
+    with pytest.raises(
+        ValueError, match="subtracted gravity at the positions that encoders read, not at the true ones; use MJX"
+    ):
         compiled_replay("mujoco", scene, turned, motion(scene, LINK, False), ())
 
 
@@ -236,9 +235,9 @@ def log(columns: Sequence[str], holes: bool = False) -> Recording:
 
 
 def test_a_joint_that_carries_a_measured_one_moves_with_the_log():
-    """Torques are asked of the second joint alone, and the first one tips and swings it all the same."""
+    """Torques of the second joint only are compared, but the first one tilts and accelerates it."""
     whole, part = planar(), planar(joints=["b"])
-    assert prescribed(part, log(["a", "b"])) == ("b", "a")
+    assert prescribed_joints(part, log(["a", "b"])) == ("b", "a")
     given = motion(whole, LINK, True)
     turned = {name: getattr(given, name)[:, ::-1] for name in ("position", "velocity", "acceleration")}
     space = Space(torque_offsets(["b"]))
@@ -251,14 +250,14 @@ def test_a_carrier_without_positions_is_warned_of():
     part = planar(joints=["b"])
     for recording in (log(["b"]), log(["a", "b"], holes=True)):
         with pytest.warns(UserWarning, match="does not hold the positions of a throughout, which carry"):
-            assert prescribed(part, recording) == ("b",)
+            assert prescribed_joints(part, recording) == ("b",)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert prescribed(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
+        assert prescribed_joints(planar(joints=["a"]), log(["a"])) == ("a",)  # nothing carries it
 
 
-def test_a_carried_joint_with_holes_in_its_positions_is_warned_of():
-    """One lost sample had it stand at its first position for the whole log, without a word."""
+def test_a_joint_with_gaps_in_its_positions_is_warned_of():
+    """After one lost sample the replay holds it at its first position for the whole log."""
     part, whole = planar(joints=["a"]), log(["a", "b"])
     mask = whole.channels["position"].mask.copy()
 
@@ -268,14 +267,14 @@ def test_a_carried_joint_with_holes_in_its_positions_is_warned_of():
     mask[:, 100, 1] = False
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert prescribed(part, holed()) == ("a", "b")
+        assert prescribed_joints(part, holed()) == ("a", "b")
     mask[:, 100:120, 1] = False
     with pytest.warns(UserWarning, match=r"positions of b for a part of the time: .*--start S --end S"):
-        assert prescribed(part, holed()) == ("a",)
+        assert prescribed_joints(part, holed()) == ("a",)
 
 
 @pytest.mark.parametrize("part", ["command", "servo"])
-def test_effects_that_a_prescribed_motion_cannot_have_are_refused(part: str):
+def test_effects_on_servos_are_refused_along_a_prescribed_motion(part: str):
     scene = planar()
     effect = Effect("backlash", **{part: lambda *_: None})
     with pytest.raises(ValueError, match="backlash"):
@@ -306,8 +305,8 @@ def standing(qpos0: dict[str, float]) -> Recording:
     return Recording("log", np.zeros(0), np.zeros((0, 0)), (), channels, TorqueConvention(MOTOR, True), qpos0=qpos0)
 
 
-def test_a_joint_that_is_not_in_the_log_stands_where_it_is_stated():
-    """Else the weight is taken at another angle."""
+def test_a_joint_that_is_not_in_the_log_has_its_stated_position():
+    """Its position changes the weight at the other joint."""
     scene = compile_scene(mujoco.MjSpec.from_string(LOCKED), "locked")
     space = Space((joint_damping(scene, "arm", name="damping", std=0.1, high=5.0),))
     with warnings.catch_warnings():
@@ -319,24 +318,24 @@ def test_a_joint_that_is_not_in_the_log_stands_where_it_is_stated():
         np.gradient(np.asarray(rollout.position)[0, :, 0], rollout.time[0]), rollout.time[0]
     )
     np.testing.assert_allclose(np.asarray(rollout.torque)[0, 5:-5, 0], (weight + inertia)[5:-5], atol=0.01)
-    with pytest.warns(UserWarning, match="stand still as in the scene"):
+    with pytest.warns(UserWarning, match="holds them still as in the scene"):
         make_cost(scene, space, [standing({})])
     with pytest.raises(ValueError, match="unknown joint 'waist'"):
         make_cost(scene, space, [standing({"torso": 0.7, "waist": 1.0})]).rollouts(np.zeros((1, 1)))
 
 
-def test_a_log_of_a_robot_that_floats_is_refused():
+def test_a_log_of_a_floating_robot_is_refused():
     scene = compile_scene(
         mujoco.MjSpec.from_string(LOCKED.replace('<joint name="torso" axis="0 1 0"/>', "<freejoint/>")), "walks"
     )
     with pytest.raises(
-        ValueError, match=r"the joint of body .* of scene 'walks', of several degrees, carries measured"
+        ValueError, match=r"the joint of body .* of scene 'walks' \(a free or ball joint\) carries measured"
     ):
-        prescribed(scene, standing({}))
+        prescribed_joints(scene, standing({}))
 
 
-def test_a_part_of_a_log_keeps_what_stands_still():
-    """Its end is held out; a joint that was measured, but not there, is not taken to stand where it began."""
+def test_a_part_of_a_log_keeps_stated_positions():
+    """Its end is held out.  A joint that was measured, but not there, does not stand at its first position."""
     whole = standing({"torso": 0.7, "arm": 0.0})
     part = whole.window(2.0, 3.0)
     assert part.qpos0["torso"] == 0.7 and part.qpos0["arm"] == pytest.approx(0.3 * np.sin(4.0), abs=1e-3)
@@ -344,8 +343,8 @@ def test_a_part_of_a_log_keeps_what_stands_still():
     assert fitted.qpos0["torso"] == held.qpos0["torso"] == 0.7
 
 
-def test_a_carrier_with_a_hole_in_its_positions_is_warned_of_though_its_start_is_known():
-    """As a bag's log has it: qpos0 holds every measured joint's start."""
+def test_a_carrier_with_a_gap_is_warned_of_though_its_start_is_known():
+    """A ROS bag's log states qpos0 of all measured joints."""
     scene = compile_scene(mujoco.MjSpec.from_string(LOCKED), "locked")
     log = standing({"torso": 0.0, "arm": 0.0})
     path = log.channels["position"]
@@ -354,4 +353,4 @@ def test_a_carrier_with_a_hole_in_its_positions_is_warned_of_though_its_start_is
     mask[:, 100:120, 1] = False
     holed = replace(path, columns=("arm", "torso"), values=values, mask=mask)
     with pytest.warns(UserWarning, match="the positions of torso throughout"):
-        assert prescribed(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)
+        assert prescribed_joints(scene, replace(log, channels={**log.channels, "position": holed})) == ("arm",)

@@ -1,4 +1,4 @@
-"""The motion behind a log without commands, against sines whose derivatives are known."""
+"""Smoothed and differentiated positions of a log without commands, against sines with known derivatives."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_joints_come_in_the_order_asked_for_and_repeats_are_averaged():
     np.testing.assert_allclose(swapped.acceleration, clean.acceleration[:, ::-1], atol=1e-6)
 
 
-def test_a_repeat_that_drops_out_leaves_no_step():
-    """Repeats a milliradian to either side; the mean of those that are left would jump, 1 rad/s^2 at once."""
+def test_a_gap_in_a_repeat_causes_no_step():
+    """Repeats differ by a milliradian.  Without care the mean of the others would jump."""
     rng = np.random.default_rng(4)
     repeats = sines(TIME) + np.array([-1e-3, 0.0, 1e-3])[:, None, None]
     repeats += 3e-5 * rng.normal(size=(3, 1, 1)) * TIME[None, :, None]
@@ -70,8 +70,8 @@ def test_a_lower_cutoff_lets_less_noise_through():
     assert errors[1] < 0.1 * errors[0]
 
 
-def test_a_clock_that_jitters_is_no_other_motion():
-    """A filter that took the samples for evenly spaced would see hundreds of rad/s^2."""
+def test_a_jittering_clock_is_resampled():
+    """A filter that assumed even samples would give hundreds of rad/s^2."""
     jitter = np.random.default_rng(2).uniform(-0.45, 0.45, len(TIME)) * 1e-3
     time = TIME + np.r_[0.0, jitter[1:-1], 0.0]
     kept = np.r_[0:2000, 2010:4000, 4015:6000]  # and where 10 and 15 samples were lost
@@ -89,7 +89,7 @@ def test_a_gap_that_no_filter_bridges_is_refused():
 
 
 def test_a_short_gap_is_bridged():
-    """What was recorded there is not looked at, and the filter sees nothing of the spline in its place."""
+    """The masked values are not used, and the spline in their place does not disturb the filter."""
     values, mask = sines(TIME)[None].copy(), np.ones((1, len(TIME), 2), bool)
     mask[0, 1234:1243, 1] = False
     values[~mask] = np.nan
@@ -100,7 +100,7 @@ def test_a_short_gap_is_bridged():
 
 @pytest.mark.parametrize("stamps", [True, False], ids=["masked", "without stamps"])
 def test_a_lost_sample_of_a_slow_log_is_bridged(stamps: bool):
-    """At 50 Hz two steps are more than a quarter of the cutoff's period, and the log was refused."""
+    """At 50 Hz two steps are more than a quarter of the cutoff's period."""
     time = TIME[::20]
     mask = np.ones((1, len(time), 2), bool)
     mask[0, 133] = False
@@ -129,8 +129,8 @@ def test_what_cannot_be_a_motion_is_refused():
 
 
 @pytest.mark.parametrize(("rate", "cutoff"), [(50.0, 20.0), (30.0, 12.0), (100.0, 20.0)])
-def test_a_slow_log_loses_nothing_of_a_fast_motion(rate: float, cutoff: float):
-    """Differences between its samples would lose up to 15 % of the acceleration here."""
+def test_a_slow_log_of_a_fast_motion_is_differentiated_exactly(rate: float, cutoff: float):
+    """Finite differences between its samples would lose up to 15 % of the acceleration."""
     time = np.arange(0, 8.0, 1 / rate)
     wave = 2 * np.pi * 3.0 * time
     position = np.stack([0.2 * np.sin(wave), 0.2 * np.cos(wave)], axis=1)
@@ -144,7 +144,7 @@ def test_a_slow_log_loses_nothing_of_a_fast_motion(rate: float, cutoff: float):
 
 
 def test_repeats_of_another_motion_are_not_averaged():
-    """A log that was cut a second later is the same motion, but not at the same time."""
+    """A log that was cut a second later is the same motion at another time."""
     later = log(np.stack([sines(TIME), sines(TIME + 1.0)]))
     with pytest.raises(ValueError, match=r"'log' holds no commands, and repeat [01] is another motion.*cut the logs"):
         measured_motion(later, JOINTS)
@@ -155,8 +155,8 @@ def test_repeats_of_another_motion_are_not_averaged():
     measured_motion(log(np.stack([sines(TIME)] * 2), mask=mask), JOINTS)
 
 
-def test_what_no_torque_feels_may_stand_elsewhere_in_every_repeat():
-    """A wheel below, or a second arm beside."""
+def test_joints_without_effect_on_the_torques_may_differ_between_repeats():
+    """Such as a wheel below, or a second arm."""
     parked = np.stack([sines(TIME)] * 2)
     parked[:, :, 1] = [[13.2], [15.9]]
     with pytest.raises(ValueError, match=r"b is 1\.35 from it"):

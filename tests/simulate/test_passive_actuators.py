@@ -1,4 +1,4 @@
-"""Actuators without a command (a gripper that a tendon drives, in a log of the arm): held where the motion starts."""
+"""Actuators without a command, such as a gripper with a tendon in a log of the arm, hold their start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.preflight.preflight import left_alone
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.simulate.initial_state import holding
+from droid_jax.simulate.initial_state import holding_controls
 from droid_jax.simulate.replay import make_drive
 from droid_jax.synthetic.robot import _control
 
@@ -60,7 +60,7 @@ def scene() -> Scene:
 
 
 def by_hand(steps: int = 8) -> np.ndarray:
-    """[T] N m at the shoulder, stepped in plain C with every control given."""
+    """[T] N m at the shoulder, by mj_step with all controls given."""
     model = mujoco.MjModel.from_xml_string(ARM)
     model.opt.timestep = 0.002 / steps
     data, torque = mujoco.MjData(model), np.empty(len(TIME))
@@ -87,7 +87,7 @@ def recording(**more: np.ndarray) -> Recording:
 
 
 def with_positions(given: Recording, names: tuple[str, ...], scatter: float = 0.0) -> Recording:
-    """The recording with measured positions of joints that stand still where they start, in four repeats."""
+    """The recording with measured positions of joints that do not move, in four repeats."""
     torque = given.channels["torque"]
     values = np.repeat(torque.values, 4, axis=0)
     still = np.tile([START[n] for n in names], (4, len(TIME), 1)) + scatter * np.arange(4)[:, None, None]
@@ -102,20 +102,20 @@ def space(arm: Scene) -> Space:
     return Space((joint_damping(arm, "shoulder", std=0.5, high=9.0),))
 
 
-def test_holding_controls_pull_nowhere():
+def test_holding_controls_exert_no_force():
     arm = scene()
     model, data = arm.model, mujoco.MjData(arm.model)
     qpos = arm.initial_qpos(START)
-    data.qpos[:], data.ctrl[:] = qpos, holding(arm, qpos)
+    data.qpos[:], data.ctrl[:] = qpos, holding_controls(arm, qpos)
     mujoco.mj_forward(model, data)
     assert data.actuator_force == pytest.approx(np.zeros(3), abs=1e-9)
     assert data.ctrl == pytest.approx([0.2, GRIP, 0.3])
-    far = holding(arm, arm.initial_qpos({"a": 1.0, "b": 1.0}))
+    far = holding_controls(arm, arm.initial_qpos({"a": 1.0, "b": 1.0}))
     assert far[1] == 255.0  # its range ends there
 
 
 @pytest.mark.slow
-def test_what_has_no_command_is_held_and_said():
+def test_actuators_without_command_hold_and_are_reported():
     arm = scene()
     with pytest.warns(UserWarning, match="'wave' has not all commands: grip, thumb held where the motion starts"):
         cost = make_cost(arm, space(arm), [recording()])
@@ -132,18 +132,18 @@ def test_a_measured_joint_needs_its_command():
         make_drive(whole, recording())
 
 
-def test_a_motor_without_a_command_is_given_nothing_and_that_is_said():
+def test_a_motor_without_command_gets_zero_and_is_reported():
     spec = mujoco.MjSpec.from_string(ARM.replace('<position joint="thumb" kp="20" kv="1"/>', '<motor joint="thumb"/>'))
     arm = compile_scene(spec, "arm", joints=["shoulder"])
     assert left_alone(arm, recording()) == (
         "recording 'wave' has not all commands: grip held where the motion starts; thumb given 0 (no position feedback)"
     )
-    with pytest.raises(ValueError, match="does not tell where thumb starts"):  # commanded, and a torque tells no place
+    with pytest.raises(ValueError, match="does not say where thumb starts"):  # a commanded torque gives no position
         make_drive(arm, replace(recording(thumb=np.zeros(len(TIME))), qpos0={"shoulder": 0.2}))
 
 
 @pytest.mark.filterwarnings("ignore:recording 'wave' has not all commands")
-def test_what_is_held_starts_where_it_was_measured_in_each_part_of_the_repeats():
+def test_held_joints_start_at_their_measured_position_in_each_part():
     arm, whole = scene(), with_positions(recording(), ("shoulder", "thumb", "a", "b"), scatter=1e-5)
     first, last = whole.repeats_subset([0, 1]), whole.repeats_subset([2, 3])
     drive = make_drive(arm, first)

@@ -1,4 +1,4 @@
-"""Repeats that start apart are each compared with a replay from where they start."""
+"""Repeats with different starts are each compared with a replay from their own start."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.preflight.check_log import check_log
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.simulate.repeat_starts import own_starts, spread
+from droid_jax.simulate.repeat_starts import own_starts, start_ranges
 
 NOISE = 0.05  # N m
 APART = 0.02  # rad
@@ -33,7 +33,7 @@ def space(scene: Scene) -> Space:
 
 
 def repeats(scene: Scene, count: int, apart: float, noise: float = 1e-4) -> Recording:
-    """The arm in C, each repeat from a start of its own; in fine steps."""
+    """The arm in C in fine steps, each repeat from another start."""
     time, command = motion(2.0)
     model = mujoco.MjModel.from_xml_string(scene.spec.to_xml())
     model.dof_damping[1] = TRUE
@@ -60,9 +60,9 @@ def repeats(scene: Scene, count: int, apart: float, noise: float = 1e-4) -> Reco
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
-def test_fit_and_held_out_repeats_that_start_apart(scene: Scene, engine: str):
+def test_fitted_and_held_out_repeats_with_different_starts(scene: Scene, engine: str):
     whole = repeats(scene, 8, APART)
-    assert min(spread(whole).values()) > 0.015
+    assert min(start_ranges(whole).values()) > 0.015
     stated = own_starts(replace(whole, qpos0={"shoulder": 0.0, "elbow": -0.3}))
     assert stated.qpos0 == {}
     fit, held = stated.repeats_subset([0, 1, 2, 5, 6]), stated.repeats_subset([3, 4, 7])  # 18 mrad apart on average
@@ -80,10 +80,10 @@ def test_fit_and_held_out_repeats_that_start_apart(scene: Scene, engine: str):
     assert gap.closed is not None and gap.closed > (0.9 if engine == "mjx" else 0.5)
 
 
-def test_the_spread_is_told_and_close_starts_are_left_alone(scene: Scene):
+def test_the_range_of_starts_and_close_starts(scene: Scene):
     (note,) = check_log(scene, repeats(scene, 4, APART))
     assert note.severity == "note" and "repeats start up to 0.0" in note.sentence
     near = repeats(scene, 4, 0.001)
-    assert spread(near) == {} and own_starts(near) is near
+    assert start_ranges(near) == {} and own_starts(near) is near
     noisy = repeats(scene, 4, 0.0, noise=0.01)
-    assert spread(noisy) == {}
+    assert start_ranges(noisy) == {}

@@ -1,4 +1,4 @@
-"""The servo replay on a small arm: commands, offsets, conventions and refusals against closed forms."""
+"""The servo replay of a small arm against closed forms: commands, offsets, conventions, errors."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ ROWS = [
 
 
 def weighed_arm(gravcomp: bool, friction: float, motors: bool) -> Scene:
-    """The arm; motors: they compensate its weight (actuatorgravcomp)."""
+    """The arm; motors: whether they compensate its weight (actuatorgravcomp)."""
     given = dict(gravcomp='gravcomp="1"' if gravcomp else "", friction=f'frictionloss="{friction}"', sensor="")
     xml = ARM.format(**given).replace('axis="0 1 0"', f'axis="0 1 0" actuatorgravcomp="{str(motors).lower()}"')
     return compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS)
@@ -66,7 +66,7 @@ def replayed(
     motors: bool = False,
     **options: float,
 ) -> Rollout:
-    """ROWS on one arm, in one program: every new program compiles for seconds."""
+    """ROWS on one arm, in one program, since each program compiles for seconds."""
     scene = weighed_arm(gravcomp, friction, motors)
     replay = servo_replay(
         scene, make_drive(scene, recording(torque=torque)), (torque_offset_effect(JOINTS),), **options
@@ -91,7 +91,7 @@ def rollout() -> Rollout:
 
 
 def servo_torque(position: np.ndarray, delay: float) -> np.ndarray:
-    """kp (command(t - delay) - q), the command held at its ends."""
+    """kp (command(t - delay) - q), with the command constant beyond its ends."""
     time, command = motion()
     late = np.stack([np.interp(time - delay, time, c) for c in command.T], axis=1)
     return np.array([KP[j] for j in JOINTS]) * (late - position)
@@ -111,11 +111,11 @@ def test_a_time_offset_delays_the_command(rollout: Rollout, row: int):
 
 
 def test_a_delayed_command_gives_a_delayed_motion(rollout: Rollout):
-    """Seven whole steps: the same trajectory, 14 ms later (the arm rests at the start)."""
+    """Seven whole steps give the same trajectory 14 ms later (the arm starts at rest)."""
     np.testing.assert_allclose(rollout.position[5, 7:], rollout.position[0, :-7], atol=1e-5)
 
 
-def test_torque_offsets_are_added_to_their_own_joint(rollout: Rollout):
+def test_torque_offsets_are_added_to_their_joint(rollout: Rollout):
     np.testing.assert_array_equal(rollout.position[3], rollout.position[0])
     np.testing.assert_allclose(rollout.torque[3] - rollout.torque[0], np.tile([-0.25, 0.5], (501, 1)), atol=1e-6)
 
@@ -141,7 +141,7 @@ def test_columns_are_matched_by_name(scene: Scene, drive: Drive, rollout: Rollou
 
 
 def test_a_coarse_late_command_is_resampled_onto_the_steps(scene: Scene):
-    """100 Hz from t = 3 s becomes 500 Hz from 0, on the straight line between commands."""
+    """100 Hz from t = 3 s is interpolated linearly to 500 Hz from 0."""
     time, command = motion(1.0, 100.0)
     coarse = make_drive(scene, recording(time=time + 3.0, command=command, channels={}))
     assert len(coarse.time) == 501 and coarse.time[0] == 0.0
@@ -180,37 +180,37 @@ def test_parity_replay_is_mj_step(scene: Scene, drive: Drive):
     np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=2e-6)
 
 
-def test_the_twin_is_mj_step(scene: Scene, drive: Drive):
+def test_the_c_replay_is_mj_step(scene: Scene, drive: Drive):
     got = c_replay(scene, SPACE, drive)(SPACE.mean[None])
     position, velocity, torque = c_rollout(scene, drive, delay=0.001)
     np.testing.assert_allclose(got.torque[0], torque, atol=1e-12)
     np.testing.assert_allclose(got.position[0], position + 0.001 * velocity, atol=1e-12)
-    told = velocity[:-1] + 0.5 * np.diff(velocity, axis=0)
-    np.testing.assert_allclose(got.velocity[0, :-1], told, atol=1e-12)
+    reported = velocity[:-1] + 0.5 * np.diff(velocity, axis=0)
+    np.testing.assert_allclose(got.velocity[0, :-1], reported, atol=1e-12)
 
 
 @pytest.mark.slow  # quick with effects: tests/model/effects/test_parity.py
-def test_the_twin_tells_what_the_parity_replay_tells(scene: Scene, drive: Drive):
-    twin, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
+def test_the_c_replay_equals_the_parity_replay(scene: Scene, drive: Drive):
+    in_c, parity = c_replay(scene, SPACE, drive)(SPACE.mean[None]), replayed(parity=True)
     for channel in ("torque", "position", "velocity"):
-        np.testing.assert_allclose(getattr(twin, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
+        np.testing.assert_allclose(getattr(in_c, channel)[0, :-1], getattr(parity, channel)[0, :-1], atol=5e-5)
 
 
 @pytest.mark.slow
-def test_without_delay_both_tell_what_mj_step_logs(scene: Scene, drive: Drive):
+def test_without_delay_both_equal_what_mj_step_logs(scene: Scene, drive: Drive):
     logged = c_rollout(scene, drive, delay=0.0)
-    twin = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
+    in_c = c_replay(scene, SPACE, drive, late=0.0)(SPACE.mean[None])
     mjx = replayed(parity=True, late=0.0)
-    for rollout, atol in ((twin, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
-        told = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
-        for got, expected, within in zip(told, logged, atol, strict=True):
+    for rollout, atol in ((in_c, (1e-12, 1e-12, 1e-12)), (mjx, (2e-6, 1e-4, 5e-5))):
+        reported = (rollout.position[0], rollout.velocity[0], rollout.torque[0])
+        for got, expected, within in zip(reported, logged, atol, strict=True):
             np.testing.assert_allclose(got, expected, atol=within)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 def test_a_cost_can_replay_as_mj_step_logs(scene: Scene, drive: Drive, engine: str):
-    """What MuJoCo itself logged with these steps costs nothing then, a hundred times less than as a robot's log."""
+    """The cost of what MuJoCo itself logged is zero then, a hundredth of the cost as a robot's log."""
     *_, torque = c_rollout(scene, drive, delay=0.0)
     values = np.stack([torque, torque])
     channel = Channel("torque", "N m", JOINTS, drive.time, values, np.ones(values.shape, bool))
@@ -241,13 +241,13 @@ def test_mj_step_needs_commands(scene: Scene):
 
 
 def test_the_replay_is_closer_to_the_continuous_arm_than_the_c_engine(scene: Scene, drive: Drive, rollout: Rollout):
-    """Against C at 20 microseconds; C at 2 ms is off by its first-order error, delayed command or not."""
+    """Against C at 20 microseconds.  C at 2 ms has its first-order error, with and without delay."""
     _, _, truth = c_rollout(scene, drive, delay=0.0, timestep=2e-5, integrator=mujoco.mjtIntegrator.mjINT_RK4)
     first_order = min(rms(c_rollout(scene, drive, delay=d)[2] - truth) for d in (0.0, 0.001))
     assert rms(rollout.torque[0] - truth) < 0.1 * first_order
 
 
-def test_a_files_own_sensors_do_not_disturb_the_twin(scene: Scene, drive: Drive):
+def test_sensors_of_the_mjcf_do_not_disturb_the_c_replay(scene: Scene, drive: Drive):
     busy = arm(sensor='<jointpos joint="elbow"/><actuatorfrc actuator="s"/>')
     expected = c_replay(scene, SPACE, drive)(SPACE.mean[None])
     got = c_replay(busy, SPACE, drive)(SPACE.mean[None])
@@ -255,7 +255,7 @@ def test_a_files_own_sensors_do_not_disturb_the_twin(scene: Scene, drive: Drive)
     np.testing.assert_array_equal(got.position, expected.position)
 
 
-def test_the_twin_keeps_every_option(drive: Drive):
+def test_the_c_replay_keeps_every_option(drive: Drive):
     light = with_options(arm(gravcomp=False), gravity=[0.0, 0.0, -1.6])
     got = c_replay(light, SPACE, drive)(SPACE.mean[None])
     np.testing.assert_allclose(got.torque[0], c_rollout(light, drive, delay=0.001)[2], atol=1e-12)
@@ -265,7 +265,7 @@ def test_the_twin_keeps_every_option(drive: Drive):
 
 
 def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armature: bool, gravity: bool) -> np.ndarray:
-    """[T, 2] N m that rigid links ask for, from C: M(q) a + c(q, v) [+ g(q)]."""
+    """[T, 2] N m of rigid links, from C: M(q) a + c(q, v) [+ g(q)]."""
     model = scene.model.__copy__()
     if not armature:
         model.dof_armature[:] = 0
@@ -282,8 +282,8 @@ def inverse(scene: Scene, q: np.ndarray, v: np.ndarray, a: np.ndarray, *, armatu
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gravity", "friction"), [(False, 0.0), (True, 0.4)])
-def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float):
-    """Without rotor inertia, joint damping and the joint's dry friction; with gravity where stated."""
+def test_link_side_torque_is_inverse_dynamics_of_the_links(gravity: bool, friction: float):
+    """Without rotor inertia, joint damping and the joint's dry friction; with gravity if stated."""
     scene = arm(friction=friction)
     got = replayed(TorqueConvention(TorqueSide.LINK, gravity), friction=friction)
     h = float(scene.model.opt.timestep)
@@ -297,7 +297,7 @@ def test_link_side_torque_is_what_moves_the_links(gravity: bool, friction: float
     assert np.sqrt(np.mean((servo_torque(q, 0.0)[1:-1] - expected) ** 2)) > 0.3  # what the motor's side reads
 
 
-@pytest.mark.slow  # quick with effects: test_effects_enter_where_they_say
+@pytest.mark.slow  # quick with effects: test_effects_enter_at_their_place
 def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, rollout: Rollout):
     heavy = replayed(TorqueConvention(TorqueSide.MOTOR, True))
     np.testing.assert_array_equal(heavy.position[0], rollout.position[0])
@@ -309,7 +309,7 @@ def test_motor_side_with_gravity_adds_the_compensated_weight(scene: Scene, rollo
 @pytest.mark.slow
 @pytest.mark.parametrize("gravity", [False, True])
 def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
-    """With actuatorgravcomp the motors' torque contains the weight, and only then."""
+    """Only with actuatorgravcomp the motors' torque contains the weight."""
     convention = TorqueConvention(TorqueSide.MOTOR, gravity)
     by_motors, elsewhere = replayed(convention, motors=True), replayed(convention)
     q = by_motors.position[0].astype(float)
@@ -322,9 +322,9 @@ def test_weight_that_the_motors_compensate_is_counted_once(gravity: bool):
 
 
 @pytest.mark.slow
-def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none():
+def test_uncompensated_weight_is_refused_for_torques_without_gravity():
     heavy = arm(gravcomp=False)
-    with pytest.raises(ValueError, match=r"'wave' says that its torque holds no weight.*shoulder, elbow.*gravcomp"):
+    with pytest.raises(ValueError, match=r"'wave' says that its torque excludes gravity.*shoulder, elbow.*gravcomp"):
         make_drive(heavy, recording())
     torque = replayed(TorqueConvention(TorqueSide.MOTOR, gravity=True), gravcomp=False)
     np.testing.assert_allclose(torque.torque[0], servo_torque(torque.position[0], 0.0), atol=2e-5)
@@ -334,7 +334,7 @@ def test_weight_that_nothing_compensates_is_refused_where_the_torque_holds_none(
     make_cost(heavy, SPACE, [recording(channels=measured(0.2))], engine="mujoco", config=only_position)
 
 
-def test_upright_axes_feel_no_weight():
+def test_vertical_axes_carry_no_weight():
     xml = ARM.format(gravcomp="", friction="", sensor="").replace('axis="0 1 0"', 'axis="0 0 1"')
     make_drive(compile_scene(mujoco.MjSpec.from_string(xml), "arm", joints=JOINTS), recording())
 
@@ -349,7 +349,7 @@ NOTHING = Space((time_offset(),))
 
 
 def pendulums(*names: str) -> Scene:
-    """One beside the other, each with its force limit."""
+    """Two pendulums, each with its force limit."""
     bodies = [PENDULUM.format(name=n, y=k, joint=LIMITS[n][0]) for k, n in enumerate(names)]
     servos = [SERVO.format(name=n, actuator=LIMITS[n][1]) for n in names]
     xml = f"""<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>{"".join(bodies)}</worldbody>
@@ -388,14 +388,14 @@ def free_and_limited() -> tuple[Rollout, np.ndarray, np.ndarray]:
 
 
 def test_a_servos_velocity_gain_acts_at_the_time_of_the_position(free_and_limited):
-    """The torque is the servo's at the mean velocity of the step; at the velocity before it, it is 0.1 of it off."""
+    """The torque is the servo's at the mean velocity of the step; with that before the step it is wrong by a tenth."""
     got, torque, _ = free_and_limited
     assert rms(got.torque[0, :, 0] - torque[:, 0]) < 0.02 * rms(torque[:, 0])
 
 
 @pytest.mark.parametrize("limit", ["actuator", "joint"])
 def test_a_servo_at_its_force_limit_damps_nothing(free_and_limited, limit: str):
-    """What the limit holds does not follow the velocity: neither its torque nor the motion it makes."""
+    """At the limit neither its torque nor the motion depends on its velocity gain."""
     got, torque, position = free_and_limited
     k = list(LIMITS).index(limit)
     assert np.mean(np.abs(torque[:, k]) >= 2.0) > 0.2 and got.torque[..., k].max() <= 2.0
@@ -413,10 +413,10 @@ def test_parity_with_a_velocity_gain_is_mj_step():
 # ----- effects
 
 
-def test_effects_enter_where_they_say(scene: Scene, rollout: Rollout):
-    """A constant force, two command laws and an observation, each against what it must do.
+def test_effects_enter_at_their_place(scene: Scene, rollout: Rollout):
+    """A constant force, two command laws and an observation, each against its closed form.
 
-    The second law, a delay of 20 ms, sees what the first makes of the command.  The torque holds the weight.
+    The second law, a delay of 20 ms, gets the command changed by the first.  The torque contains gravity.
     """
     drive = make_drive(scene, recording(torque=TorqueConvention(TorqueSide.MOTOR, True)))
     seen = {}
@@ -442,12 +442,12 @@ def test_effects_enter_where_they_say(scene: Scene, rollout: Rollout):
     assert torque[-1, 1] - rollout.torque[0, -1, 1] < -1.0
 
 
-def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
+def test_the_c_replay_refuses_unsupported_effects(scene: Scene, drive: Drive):
     kick = Effect("kick", force=lambda theta, state: state.qvel)
     with pytest.raises(ValueError, match="effects depend on the state: kick"):
         c_replay(scene, SPACE, drive, [kick])
     for convention in (TorqueConvention(TorqueSide.LINK, False), TorqueConvention(TorqueSide.MOTOR, True)):
-        with pytest.raises(ValueError, match="its torque is the actuators': motor-side"):
+        with pytest.raises(ValueError, match="it gives actuator torques: motor-side"):
             c_replay(scene, SPACE, replace(drive, torque=convention))
 
 
@@ -455,7 +455,7 @@ def test_the_twin_refuses_what_it_cannot_run(scene: Scene, drive: Drive):
 
 
 @pytest.mark.slow
-def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
+def test_a_cost_accepts_only_other_repeats_of_the_same_motion(scene: Scene):
     cost = make_cost(scene, SPACE, [recording()])
     elsewhere = {"shoulder": 0.5, "elbow": -0.3}
     for other in (
@@ -477,7 +477,7 @@ def test_a_cost_serves_other_repeats_of_the_same_motion_alone(scene: Scene):
 
 
 def test_a_cost_keeps_its_steps(scene: Scene):
-    """Against another config, mj_step was silently not what had been asked for."""
+    """Another config must not change mj_step."""
     cost = make_cost(scene, SPACE, recording(), config=CompareConfig(mj_step=True))
     with pytest.raises(ValueError, match="compiled with another mj_step"):
         cost.against([recording()], CompareConfig())
@@ -493,8 +493,8 @@ def test_joint_friction_that_is_given_as_an_effect_counts_once(scene: Scene):
 
 
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
-def test_a_stated_gain_stands_in_for_the_scenes(engine: str):
-    """As a scene that was written with it: stiffness, and damping where the servo has a velocity gain."""
+def test_a_stated_gain_replaces_the_scenes(engine: str):
+    """As if the scene had it: stiffness, and damping if the servo has a velocity gain."""
     kp, kd = np.array([90.0, 10.0]), np.array([3.0, 2.0])  # shoulder, elbow
     spec = arm().spec.copy()
     for actuator in spec.actuators:
@@ -519,7 +519,7 @@ def test_a_stated_gain_stands_in_for_the_scenes(engine: str):
 
 
 def test_damping_that_is_not_stated_is_the_scenes():
-    """As many numbers as stiffnesses were demanded, and the 0 that stood for none switched the velocity gain off."""
+    """Stated stiffness without damping keeps the velocity gain."""
     spec = arm().spec.copy()
     for actuator in spec.actuators:
         actuator.biasprm[2] = -1.5
@@ -532,8 +532,8 @@ def test_damping_that_is_not_stated_is_the_scenes():
     assert "the scene's: damping of shoulder 0 in place of 1.5" in off
 
 
-def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
-    assert "of elbow not the stated damping is used" in gains_note(
+def test_stated_damping_without_velocity_gain_is_reported(scene: Scene):
+    assert "for elbow it uses the joint's damping, not the stated one" in gains_note(
         scene, recording(gains=ServoGains(np.array([90.0, 25.0]), np.array([3.0, 7.0])))
     )
 
@@ -542,7 +542,7 @@ def test_damping_that_no_velocity_gain_takes_is_said(scene: Scene):
 
 
 def test_friction_effects_without_a_friction_row_are_refused():
-    """0 and 5 N m gave the same cost, without a word: MJX has friction rows only where it compiled friction."""
+    """MJX has constraint rows only for friction in the compiled model, so that 5 N m would have no effect."""
     bare = arm()
     effects = library(bare, ["joint_coulomb"])
     with pytest.raises(ValueError, match=r"'joint_coulomb' raises dry friction of shoulder, elbow, .*ready\(scene\)"):
@@ -555,7 +555,7 @@ def test_friction_effects_without_a_friction_row_are_refused():
 
 
 def test_a_model_that_was_changed_after_it_was_compiled_is_refused():
-    """MJX kept the old numbers, and all that is read from the model had the new ones: a mixture, without a word."""
+    """MJX would have the old numbers and other code the new ones."""
     scene = arm()
     scene.model.dof_damping[:] = 2.0  # before it is compiled nothing is mixed
     make_cost(scene, SPACE, recording())
@@ -572,8 +572,8 @@ def test_a_recording_without_commands_is_refused(scene: Scene):
         make_drive(scene, log)
 
 
-def test_gains_of_what_is_no_servo_are_told_to_need_one():
-    """A motor has no gain that a stated one could stand in for."""
+def test_gains_of_an_actuator_that_is_no_servo_are_refused():
+    """A motor has no gain that a stated one could replace."""
     spec = arm().spec.copy()
     spec.actuators[1].set_to_motor()
     scene = compile_scene(spec, "driven", joints=JOINTS)
@@ -594,7 +594,7 @@ def test_missing_and_foreign_columns_are_named(scene: Scene):
 
 
 @pytest.mark.parametrize(("left", "says"), [(0, "has no actuators"), (1, "has no actuator for shoulder")])
-def test_commanded_joints_without_an_actuator_are_the_scenes_fault(left: int, says: str):
+def test_commanded_joints_without_an_actuator_are_refused(left: int, says: str):
     xml = ARM.format(gravcomp="", friction="", sensor="")
     start, end = xml.index("<actuator>"), xml.index("<sensor>")
     kept = '<actuator><position name="e" joint="elbow" kp="25"/></actuator>' * left
@@ -604,7 +604,7 @@ def test_commanded_joints_without_an_actuator_are_the_scenes_fault(left: int, sa
 
 
 @pytest.mark.parametrize(("option", "says"), [('integrator="RK4"', "Euler"), ('cone="elliptic"', "pyramidal")])
-def test_an_option_that_no_replay_has_is_told_with_the_scene(option: str, says: str):
+def test_unsupported_options_are_refused_with_the_scenes_name(option: str, says: str):
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace('integrator="implicitfast"', option)
     odd = compile_scene(mujoco.MjSpec.from_string(xml), "odd", joints=JOINTS, engine="mujoco")
     with pytest.raises(ValueError, match=f"a replay of scene 'odd' .*{says}"):
@@ -626,8 +626,8 @@ UNSTABLE = Space(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
-def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str):
-    """Negative damping of 1500 N m s/rad flings the arm to infinity within a few steps."""
+def test_a_diverging_replay_costs_the_penalty_and_affects_no_other(engine: str):
+    """Negative damping of 1500 N m s/rad makes the arm diverge within a few steps."""
     scene = arm()
     cost = make_cost(scene, UNSTABLE, [recording()], engine=engine)
     good = np.array([[1.0], [2.0]])
@@ -641,7 +641,7 @@ def test_a_replay_that_blows_up_costs_the_penalty_and_harms_no_other(engine: str
 
 
 @pytest.mark.parametrize("trace", ["torque", "position", "velocity", "object_angle"])
-def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
+def test_a_rollout_with_nan_is_not_finite(trace: str):
     still = Rollout(*np.zeros((7, 5, 2)))
     assert apply_sensor_model(still, {}, ()).finite
     broken = getattr(still, trace).copy()
@@ -649,8 +649,8 @@ def test_a_rollout_with_a_number_that_is_none_is_not_finite(trace: str):
     assert not apply_sensor_model(replace(still, **{trace: broken}), {}, ()).finite
 
 
-def test_actuators_with_a_state_of_their_own_are_refused():
-    """The scan does not carry activations: a filtered actuator would be reset at every step."""
+def test_actuators_with_a_state_are_refused():
+    """The time loop does not carry activations, so a filtered actuator would be reset at each step."""
     xml = ARM.format(gravcomp='gravcomp="1"', friction="", sensor="").replace(
         '<position name="s" joint="shoulder" kp="60"/>',
         '<position name="s" joint="shoulder" kp="60" timeconst="0.1"/>',

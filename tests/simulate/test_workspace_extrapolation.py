@@ -50,7 +50,7 @@ def further(name: str) -> Recording:
 
 @pytest.mark.parametrize("name", ["A", pytest.param("C", marks=pytest.mark.slow)])
 def test_the_door_goes_a_third_further_and_comes_back(name: str):
-    """C closes again afterwards: what follows the widest opening follows it still, later."""
+    """C closes the door afterwards; its motion after the widest opening is delayed, but unchanged."""
     demonstration, before = plan(name)
     longer = further(name)
     after = replayed(longer)
@@ -64,7 +64,7 @@ def test_the_door_goes_a_third_further_and_comes_back(name: str):
     assert after.contact[last : last + int(added / (after.time[1] - after.time[0]))].all()  # the knob stays in the hand
 
 
-def test_the_servo_is_not_asked_for_jerks():
+def test_the_command_has_no_jerks():
     (demonstration, _), longer = plan("A"), further("A")
 
     def fastest(recording: Recording) -> np.ndarray:
@@ -75,7 +75,7 @@ def test_the_servo_is_not_asked_for_jerks():
         assert channel.values.shape[1] == len(channel.time)
 
 
-def test_out_of_reach_or_not_held_is_nothing():
+def test_out_of_reach_or_without_grip_gives_none():
     demonstration, before = plan("A")
     far = replace(before, object_angle=before.object_angle * 3)
     lost = replace(before, contact=np.zeros_like(before.contact))
@@ -91,7 +91,7 @@ def test_a_stop_of_the_hinge_is_not_passed():
     assert opened_further(replace(scene(), model=model), demonstration, before) is None
 
 
-def test_a_hand_that_holds_nothing_opens_nothing():
+def test_a_hand_without_object_gives_none():
     small, _ = small_scene()
     _, before = plan("A")
     assert opened_further(small, record("train"), before) is None

@@ -1,4 +1,4 @@
-"""Hidden effects: none at zero, each where it belongs, each against a computation of its own."""
+"""Hidden effects: no change at zero, the right joints, and an independent computation of each."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from droid_jax.recordings.recording import Channel, Recording, TorqueConvention,
 from droid_jax.simulate.c_engine import instrument
 from droid_jax.synthetic import arm_effects, friction_effects, hinge_effects, hooks
 from droid_jax.synthetic.hidden_effects import HIDDEN, LONGEST_STEP, Applied, hidden_effect, possible, record_hidden
-from droid_jax.synthetic.hooks import Influence, Live, Place, Seen
+from droid_jax.synthetic.hooks import Influence, Live, Place, SensorInput
 from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
 # A two-link arm and a servo-driven flap with a knob that the arm never touches.
@@ -76,7 +76,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def demonstration(scene: Scene) -> Recording:
-    """0.8 s: the flap opens to 0.8 rad and half closes again, the arm swings along; flap, shoulder, elbow."""
+    """0.8 s: the flap opens to 0.8 rad and half closes again while the arm moves; flap, shoulder, elbow."""
     clock = np.arange(401) / 500
     flap = 0.4 * (1 - np.cos(2 * np.pi * clock / 0.8))
     command = np.stack([flap, 0.4 - 0.3 * np.sin(4 * clock), 0.5 * clock], axis=1)
@@ -116,7 +116,7 @@ def made(scene: Scene, name: str, amplitude: float, joints: Sequence[str] | None
 
 
 def stepped(influence: Influence, live: Live, times: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What one effect adds to applied torque, friction loss and command, the last of some steps in one state."""
+    """Applied torque, friction loss and command of one effect in the last of some steps in one state."""
     loss, control = live.loss.copy(), live.control.copy()
     if influence.begin:
         influence.begin(live)
@@ -146,14 +146,14 @@ def test_zero_is_exactly_no_effect(scene: Scene, demonstration: Recording, plain
 
 
 @pytest.mark.parametrize("name", [n for n in HIDDEN if n != "grip_compliance"])
-def test_a_typical_amplitude_is_felt_and_the_recording_is_sound(
+def test_a_typical_amplitude_changes_a_valid_recording(
     scene: Scene, demonstration: Recording, plain: Recording, name: str
 ):
-    """The pair that touches nothing cannot show the grip: it has a test of its own."""
+    """The scene's pair has no contact, so the grip has its own test."""
     effect = HIDDEN[name]
     assert 0 < effect.typical[0] < effect.typical[1]
     recording = validate(hidden(scene, demonstration, Applied(name, effect.typical[1])))
-    assert recording.meta == plain.meta  # nothing tells what was hidden
+    assert recording.meta == plain.meta  # without what was hidden
     torque, none = recording.channel("torque").values, plain.channel("torque").values
     assert np.isfinite(torque).all()
     assert 1e-3 < np.abs(torque - none).max() < 40.0
@@ -172,9 +172,9 @@ def test_hinge_effects_act_on_the_hinge_only(scene: Scene, name: str):
     "name", [h.name for h in HIDDEN.values() if h.on in ("arm", "joint") and h.name != "firm_friction"]
 )
 def test_joint_effects_act_on_their_joint_only(scene: Scene, demonstration: Recording, plain: Recording, name: str):
-    """The flap is not coupled to the arm: its torque, noise included, is the same to the bit.
+    """The flap is not coupled to the arm, so its torque, including noise, is equal to the bit.
 
-    Firm friction is of the flap alone, which has some, and has tests of its own.
+    Only the flap has friction, so firm friction has its own tests.
     """
     recording = hidden(scene, demonstration, Applied(name, HIDDEN[name].typical[1], "elbow"))
     difference = np.abs(recording.channel("torque").values - plain.channel("torque").values)[0].max(axis=0)
@@ -324,8 +324,8 @@ def test_hinge_friction_by_hand(scene: Scene, name: str, q: float, expected: flo
 
 
 @pytest.mark.parametrize("start", [0.0, 0.35])
-def test_the_tilted_frame_is_gravity_turned(scene: Scene, start: float):
-    """Against MuJoCo's own gravity, turned by hand, for the flap alone, on hinges that are not in line."""
+def test_the_tilted_frame_turns_gravity(scene: Scene, start: float):
+    """Against MuJoCo's gravity, turned for the flap, with misaligned hinges."""
     influence, lean = made(scene, "tilted_frame", 0.12), 0.12
     live = live_at(scene, (start, 0, 0))
     assert influence.begin
@@ -347,7 +347,7 @@ def test_the_tilted_frame_is_gravity_turned(scene: Scene, start: float):
         assert abs(live.applied[0]) > 0.05
 
 
-def test_the_gasket_sucks_while_opening_and_lets_go():
+def test_the_gasket_holds_while_opening_and_detaches():
     s, fine, h = 0.0, 0.0, 0.001
     for k in range(100):  # 0.1 s at 0.2 rad/s
         s = hinge_effects.suction(s, 0.02, 0.2, h)
@@ -414,7 +414,7 @@ def test_mesh_friction_is_of_motor_and_load_and_more_when_slow(scene: Scene):
 
 
 def test_the_bristle_is_dahls(scene: Scene):
-    """Against its differential equation in small steps, through a reversal."""
+    """Against the differential equation in small steps, through a reversal."""
     force = fine = np.zeros(1)
     for v in (*[0.02] * 400, *[-0.03] * 100):
         force = friction_effects.bristle(force, 1.2, np.array([v]), 0.001)
@@ -428,14 +428,14 @@ def test_the_bristle_is_dahls(scene: Scene):
 
 
 @pytest.mark.parametrize("name", [None, "dry_friction", "bristle_friction", "torque_ripple", "payload"])
-def test_on_the_link_side_gears_are_out_of_the_torque(scene: Scene, demonstration: Recording, name: str | None):
-    """It is what the recorded motion needs (mj_inverse) without rotors, dampers and friction.
+def test_link_side_torques_exclude_the_gears(scene: Scene, demonstration: Recording, name: str | None):
+    """The torque equals mj_inverse of the recorded motion without rotors, dampers and friction.
 
-    But with a payload: that is beyond the sensor.
+    A payload is beyond the sensor.
     """
     effects = [Applied(name, 1.0)] if name else []
     smooth = copy.copy(scene.model)
-    smooth.dof_frictionloss[:] = 0  # which no sensor of C MuJoCo tells
+    smooth.dof_frictionloss[:] = 0  # no sensor of C MuJoCo measures it
     scene = replace(scene, model=smooth)
     quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
     recording = hidden(scene, demonstration, *effects, side=TorqueSide.LINK, rate=4000.0, **quiet)
@@ -460,7 +460,7 @@ def test_on_the_link_side_gears_are_out_of_the_torque(scene: Scene, demonstratio
 
 
 def test_the_payload_is_a_body_welded_to_the_hand(scene: Scene):
-    """Inertia matrix and forces against a compiled scene that carries the mass as a body of its own."""
+    """Inertia matrix and forces against a compiled scene with the mass as a separate body."""
     at = scene.model.body_ipos[scene.id("body", "fore")] + arm_effects.PAYLOAD_AT
     inertia = " ".join(["0.00063"] * 3)  # 0.7 kg, 3 cm
     tool = f'<body><inertial mass="0.7" pos="{" ".join(map(repr, at.tolist()))}" diaginertia="{inertia}"/></body>'
@@ -500,8 +500,8 @@ def test_cable_ripple_and_twist_by_hand(scene: Scene):
     np.testing.assert_allclose(turn, [0, 1e-6, 0.015, -0.015], rtol=1e-6)
 
 
-def test_an_elastic_joint_at_rest_stands_where_servo_and_spring_agree(scene: Scene, demonstration: Recording):
-    """Held against its weight: torque = stiffness (command - motor angle), and the encoder shows the motor."""
+def test_an_elastic_joint_at_rest_balances_servo_and_spring(scene: Scene, demonstration: Recording):
+    """Held against its weight: torque = stiffness (command - motor angle), and the encoder reads the motor."""
     still = replace(demonstration, command=np.tile([0.0, 0.9, 0.3], (401, 1)))
     still = replace(still, qpos0={"flap": 0.0, "shoulder": 0.9, "elbow": 0.3})
     quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
@@ -541,15 +541,15 @@ def test_grip_compliance_softens_the_grips_pairs(scene: Scene):
 
 
 def compensated(scene: Scene, share: float) -> Scene:
-    """The small scene with every body's weight compensated in that share."""
+    """The small scene with gravcomp of all bodies set to that share."""
     model = copy.copy(scene.model)
     model.body_gravcomp[:] = share
     return replace(scene, model=model)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_a_tilted_base_is_gravity_turned_and_an_upright_compensation(scene: Scene, share: float):
-    """Against MuJoCo's own gravity, of which the compensation is a vector by hand; the flap hangs upright."""
+def test_a_tilted_base_turns_gravity_but_not_its_compensation(scene: Scene, share: float):
+    """Against MuJoCo's gravity with the compensation as explicit forces; gravity on the flap is upright."""
     q, v, lean = (0.3, 0.7, -0.9), (0.2, 1.0, -2.0), 0.03
     scene = compensated(scene, share)
     live, influence = live_at(scene, q, v), made(scene, "tilted_base", lean)
@@ -574,10 +574,8 @@ def test_a_tilted_base_is_gravity_turned_and_an_upright_compensation(scene: Scen
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_an_encoders_zero_shifts_where_the_joint_stands_and_what_holds_its_weight(
-    scene: Scene, demonstration: Recording, share: float
-):
-    """Held still, the servo gives what the true pose asks for beyond the compensation of the pose that is read."""
+def test_an_encoder_offset_shifts_position_and_compensation(scene: Scene, demonstration: Recording, share: float):
+    """At rest the servo's torque is the weight in the true pose minus the compensation in the pose that is read."""
     scene, off = compensated(scene, share), 0.05
     still = replace(demonstration, command=np.tile([0.0, 0.9, 0.3], (401, 1)))
     still = replace(still, qpos0={"flap": 0.0, "shoulder": 0.9, "elbow": 0.3})
@@ -594,8 +592,8 @@ def test_an_encoders_zero_shifts_where_the_joint_stands_and_what_holds_its_weigh
 
 
 @pytest.mark.parametrize("other", ["tilted_base", "payload"])
-def test_an_encoders_zero_misplaces_the_compensation_beside_other_effects(scene: Scene, other: str):
-    """As alone: these compensate by themselves, and take the model's compensation away."""
+def test_an_encoder_offset_misplaces_the_compensation_with_other_effects(scene: Scene, other: str):
+    """Other effects apply the compensation as forces and remove the model's."""
     scene, state = compensated(scene, 1.0), ((0.0, 0.9, 0.3), (0.0, 0.0, 0.0))
     off = made(scene, "encoder_zero", 0.05, ["elbow"])
     (alone, *_), first = stepped(off, live_at(scene, *state)), made(scene, other, 0.03)
@@ -605,8 +603,8 @@ def test_an_encoders_zero_misplaces_the_compensation_beside_other_effects(scene:
     assert np.abs(alone).max() > 0.01
 
 
-def test_firm_friction_holds_what_mujocos_lets_creep():
-    """0.2 of 0.3 N m at an inertia of 0.03 kg m2: 7 mrad/s in MuJoCo; where it is firm it bends, and stands."""
+def test_firm_friction_does_not_creep():
+    """0.2 of 0.3 N m at an inertia of 0.03 kg m2 creep with 7 mrad/s in MuJoCo."""
     mjcf = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" armature="0.03" frictionloss="0.3"/>
       <inertial pos="0 0 0" mass="1e-3" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
       <actuator><motor joint="j"/></actuator></mujoco>"""
@@ -629,8 +627,8 @@ def test_firm_friction_holds_what_mujocos_lets_creep():
         path(1.5)
 
 
-def test_firm_friction_leaves_what_other_effects_add(scene: Scene):
-    """It is a share of the joint's own; it took that share of all that had been added before it."""
+def test_firm_friction_is_a_share_of_the_joints_friction_only(scene: Scene):
+    """Friction that other effects add is not part of it."""
     live, firm = live_at(scene), made(scene, "firm_friction", 0.8)
     firm.begin(live)  # type: ignore[misc]
     own = live.loss.copy()
@@ -643,8 +641,8 @@ def test_firm_friction_leaves_what_other_effects_add(scene: Scene):
 # ----- signals
 
 
-def test_a_ramp_comes_as_late_as_said():
-    """Dead time and lag both shift a ramp by their length, once the lag has settled."""
+def test_a_ramp_is_delayed_by_the_amplitude():
+    """Dead time and lag both delay a ramp by their length, after the lag has settled."""
     clock = np.arange(4001) * 0.00025
     late = hooks.lagged(np.stack([clock, np.full(4001, 3.0)], axis=1), clock, 0.014, 0.006)
     np.testing.assert_allclose(late[2000:, 0], clock[2000:] - 0.02, atol=2e-4)
@@ -654,7 +652,7 @@ def test_a_ramp_comes_as_late_as_said():
 
 def test_signals_by_hand(scene: Scene):
     clock, torque = np.array([0.0, 60.0]), np.array([[1.0, -20.0, 2.0], [0.5, 40.0, 2.0]])
-    seen = Seen(clock, torque, np.full((2, 3), math.pi / 2))
+    seen = SensorInput(clock, torque, np.full((2, 3), math.pi / 2))
 
     def sensed(name: str, amplitude: float, repeat: int = 0) -> np.ndarray:
         after = made(scene, name, amplitude, ("shoulder",), repeat).sense(seen)  # type: ignore[misc]
@@ -708,8 +706,8 @@ NOT_ON_THE_DOOR = ("firm_friction", "encoder_zero")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in HIDDEN if name not in NOT_ON_THE_DOOR])
-def test_the_door_bears_every_effect(door: tuple[Scene, Recording, dict[str, float]], bare: Recording, name: str):
-    """The largest typical amplitude on the whole motion: felt, and the grasp holds."""
+def test_the_door_opens_with_every_effect(door: tuple[Scene, Recording, dict[str, float]], bare: Recording, name: str):
+    """With the largest typical amplitude on the whole motion the effect is noticeable and the grasp holds."""
     amplitude = HIDDEN[name].typical[1]
     recording = record_hidden(*door, {name: amplitude}, seed=3, config=CONFIG)
     change = np.abs(recording.channel("torque").values - bare.channel("torque").values)

@@ -1,4 +1,4 @@
-"""The synthetic robot records, and tries a policy."""
+"""The synthetic robot records motions and runs trials of a policy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from droid_jax.recordings.recording import TorqueSide
 from droid_jax.synthetic import policy_trials as module
 from droid_jax.synthetic.hidden_effects import Applied, record_hidden
 from droid_jax.synthetic.policy_trials import TransferConfig, _senses, _trial, filmed, synthetic_robot, transfer
-from droid_jax.synthetic.robot import DRIFT_TIME, SyntheticRobotConfig, _torque_noise, set_up, synthetic_truth
+from droid_jax.synthetic.robot import SyntheticRobotConfig, _torque_noise, set_up, synthetic_truth
 
 QUIET = SyntheticRobotConfig(
     repeats=2, timestep=0.00025, torque_noise=(1e-3, 1e-3), torque_drift=(0.0, 0.0), start_noise=0.0, pose_noise=0.0
@@ -59,12 +59,12 @@ def test_noise_and_drift_are_as_large_as_they_say_at_arm_and_wrist():
     config = SyntheticRobotConfig(torque_noise=(0.0, 0.0), torque_drift=(0.04, 0.01))
     drift = _torque_noise((4, 200000, 7), config, np.random.default_rng(1))
     np.testing.assert_allclose(drift.std(axis=(0, 1)), [0.04] * 4 + [0.01] * 3, rtol=0.05)
-    lag = round(DRIFT_TIME * config.rate)
+    lag = round(config.drift_time * config.rate)
     kept = np.mean(drift[:, lag:] * drift[:, :-lag], axis=(0, 1)) / drift.var(axis=(0, 1))
     np.testing.assert_allclose(kept, np.exp(-1), atol=0.06)
 
 
-def test_every_repeat_begins_and_measures_a_little_otherwise():
+def test_repeats_differ_in_start_and_noise():
     scene, space = small_scene()
     config = replace(QUIET, start_noise=1e-3, repeats=40)
     shown = demonstration("train")
@@ -73,7 +73,7 @@ def test_every_repeat_begins_and_measures_a_little_otherwise():
     assert np.std(apart) == pytest.approx(1e-3, rel=0.3)
 
 
-def test_the_door_stands_a_little_otherwise_in_every_repeat():
+def test_repeats_differ_in_the_doors_position():
     scene, config = door_scene(), replace(QUIET, pose_noise=2e-3, repeats=40)
     robot = set_up(scene, load_recording(demonstration_path("A")), {}, seed=3, config=config)
     nuisances = door_nuisances(robot.scene)
@@ -84,7 +84,7 @@ def test_the_door_stands_a_little_otherwise_in_every_repeat():
 
 
 def test_without_a_truth_the_synthetic_robot_is_the_scene():
-    """Whether a parameter sets a number of the model, scales it or adds to it."""
+    """For parameters that set a number of the model, scale it or add to it."""
     scene, _ = small_scene()
     forearm, elbow = "forearm", "elbow"
     space = Space(
@@ -101,11 +101,11 @@ def test_without_a_truth_the_synthetic_robot_is_the_scene():
             np.testing.assert_allclose(getattr(model, field), getattr(robot.scene.model, field), rtol=1e-12)
 
 
-def test_the_link_side_of_dry_friction_in_the_model_is_not_known():
+def test_link_side_torques_with_dry_friction_in_the_model_are_refused():
     scene, space = small_scene()
     rubs = copy.copy(scene.model)
     rubs.dof_frictionloss[scene.dof("elbow")] = 0.5
-    with pytest.raises(ValueError, match=r"link side of joints with a frictionloss of their own \(elbow"):
+    with pytest.raises(ValueError, match=r"link-side torques of joints with a frictionloss \(elbow"):
         config = replace(QUIET, side=TorqueSide.LINK)
         set_up(replace(scene, model=rubs), demonstration("train"), TRUTH, seed=3, config=config, space=space)
 
@@ -144,7 +144,7 @@ def tried(scene, start, commands, truth=None, hidden=(), task=TASK) -> Trials:
     return transfer(script, synthetic_robot(scene, start, truth, hidden, task, ONE))  # type: ignore[arg-type]
 
 
-def test_an_opening_by_the_book_succeeds_with_the_grip_held(scene, start, commands):
+def test_the_demonstrated_opening_succeeds_with_grip(scene, start, commands):
     found = tried(scene, start, commands)
     assert found.success[0] and found.angle[0] > np.deg2rad(30.0)
     assert 100 < found.steps[0] < TASK.steps
@@ -164,7 +164,7 @@ def test_a_film_shows_the_same_trial(scene, start, commands):
     assert np.abs(films[0][0] - films[2][0]).max() > 1e-3
 
 
-def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, commands, monkeypatch: pytest.MonkeyPatch):
+def test_observed_frames_and_joints_are_of_one_instant(scene, start, commands, monkeypatch: pytest.MonkeyPatch):
     task, late = replace(TASK, steps=12), []
     robot = synthetic_robot(scene, start, synthetic_truth(scene, 0, 0), (), task, ONE)
 
@@ -182,12 +182,12 @@ def test_places_and_joints_that_are_seen_are_of_one_instant(scene, start, comman
 
 def test_a_policy_of_another_rate_is_refused(scene, start, commands):
     robot = synthetic_robot(scene, start, {}, (), replace(TASK, control=0.04), ONE)
-    with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task asks every 0.04 s"):
+    with pytest.raises(ValueError, match=r"the policy acts every 0.02 s, the task every 0.04 s"):
         transfer(Script(TASK, commands, interface_of(scene, TASK, start)), robot)  # type: ignore[arg-type]
 
 
-def test_a_strong_closer_is_felt(scene, start, commands):
-    """The same commands open the door less far against a preload that pulls it shut."""
+def test_a_strong_preload_reduces_the_opening(scene, start, commands):
+    """The same commands open the door less against a preload that closes it."""
     free, held = (tried(scene, start, commands, hidden=h) for h in ((), (Applied("hinge_preload", 6.0),)))
     assert held.angle[0] < free.angle[0] - np.deg2rad(1.0)
 
@@ -199,7 +199,7 @@ def test_without_friction_on_the_pads_nothing_opens(scene, start, commands):
     assert not found.success[0] and found.angle[0] < np.deg2rad(30.0)
 
 
-def test_a_hand_that_stays_where_it_is_opens_nothing(scene, start):
+def test_a_hand_at_rest_opens_nothing(scene, start):
     found = tried(scene, start, np.repeat(np.append(start[scene.joint_qpos], [0.04, 0.04])[None], 2, axis=0),
                   task=replace(TASK, steps=40))  # fmt: skip
     assert not found.success[0] and found.steps[0] == 40
@@ -221,8 +221,8 @@ def test_trials_differ_and_the_same_seed_repeats_them(scene, start, commands):
     )
 
 
-def test_a_simulation_that_blows_up_is_said(scene, start, commands):
-    """MuJoCo starts over by itself then; the trial does not go on as if nothing had happened."""
+def test_a_diverging_simulation_stops_the_trial(scene, start, commands):
+    """MuJoCo resets it; the trial must not continue."""
     script = Script(TASK, commands, interface_of(scene, TASK, start))
     seen, hinge = list[float](), scene.dof(scene.object_joint)
 
@@ -243,7 +243,7 @@ def test_the_interval_is_wilsons():
     assert (low, high) == (pytest.approx(0.711, abs=1e-3), pytest.approx(0.867, abs=1e-3))
 
 
-def test_sums_leave_out_what_failed_and_reasons_their_numbers():
+def test_statistics_of_trials():
     why = ["", "", "too fast: joint 5 at 2.7 rad/s", "too fast: joint 1 at 3.1 rad/s"]
     found = Trials(
         np.array([True, True, False, False]), np.ones(4), np.array([100, 200, 3, 5]), np.ones(4), np.array(why)
@@ -255,8 +255,8 @@ def test_sums_leave_out_what_failed_and_reasons_their_numbers():
     assert nothing["steps"]["mean"] is None and nothing["stopped"] == {}
 
 
-def test_trials_that_blew_up_are_in_no_rate_and_no_mean():
-    """Eight of eight that say something succeeded; two say nothing."""
+def test_diverged_trials_are_not_counted():
+    """All of the eight counted trials succeed; two diverge."""
     blown = np.arange(10) >= 8
     found = Trials(~blown, np.where(blown, 9.0, 1.0), np.full(10, 7), 1.0 * ~blown, np.where(blown, BLOWN_UP, ""))
     content, alone = found.to_json(), Trials(*(a[:8] for a in (found.success, found.angle, found.steps, found.grip)),
@@ -270,7 +270,7 @@ def test_trials_that_blew_up_are_in_no_rate_and_no_mean():
     assert nothing.to_json()["success_rate"] is None and nothing.to_json()["angle_deg"]["mean"] is None
 
 
-def test_amplitudes_that_cannot_be_are_refused(scene, start):
+def test_invalid_amplitudes_are_refused(scene, start):
     with pytest.raises(ValueError, match="hidden effect 'closer' needs a finite, not negative amplitude, got nan"):
         synthetic_robot(scene, start, {}, (Applied("closer", np.nan),), TASK, ONE)
 
@@ -280,8 +280,8 @@ def test_effects_on_whole_traces_are_refused(scene, start, commands):
         tried(scene, start, commands, hidden=(Applied("command_delay", 0.01),))
 
 
-def test_the_sensors_are_as_noisy_as_they_say(scene):
-    """The camera is wrong by the same all along a trial, and by something else in the next."""
+def test_sensor_noise_has_the_configured_size(scene):
+    """The camera's error is constant in a trial, and different in the next."""
     config = TransferConfig(position_noise=1e-3, velocity_noise=2e-2, knob_noise=3e-3)
     data = mujoco.MjData(scene.model)
     mujoco.mj_forward(scene.model, data)

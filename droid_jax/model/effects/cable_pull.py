@@ -1,4 +1,4 @@
-"""A cable or hose that pulls a joint of the arm back to where it hangs free."""
+"""A cable or hose that pulls a joint of the arm."""
 
 import jax.numpy as jnp
 
@@ -12,7 +12,7 @@ STIFFNESS, PULL = "cable_stiffness", "cable_pull"
 
 @register
 def cable_pull(scene: Scene) -> Effect | None:
-    """-k (q - q0) - p in a joint: stiffness k, N m/rad, and the pull p at q0, the model's reference pose, N m."""
+    """-k (q - q0) - p in a joint: stiffness k, N m/rad, and pull p, N m, at the model's reference position q0."""
     joints, positions = a.arm(scene), a.arm_qpos(scene)
     if not joints:
         return None
@@ -30,7 +30,7 @@ def cable_pull(scene: Scene) -> Effect | None:
         description="a cable or hose that pulls on a joint of the arm",
         signature="smooth in the position of one joint, the same at every speed",
         confused_with=("payload", "torque_bias"),
-        special_cases=("torque_bias",),  # a pull that does not change with the angle
+        special_cases=("torque_bias",),  # for k = 0
         locations=a.locations(joints, STIFFNESS, PULL),
         minimum_size=0.1,
     )

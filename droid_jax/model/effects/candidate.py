@@ -1,4 +1,4 @@
-"""An effect at a location, with a shape: what a model may lack, and what a fitted model may have."""
+"""Candidates of a search: an effect at a location, with values of its shape parameters."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from droid_jax.model.effect_interface import Effect
 
 @dataclass(frozen=True, order=True)
 class EffectKey:
-    """Which effect, where, and in which shape; no shape where only the location matters.
+    """An effect at a location, optionally with values of its shape parameters.
 
-    effect: its name.
-    location: a key of `Effect.locations`.
-    shape: (shape parameter, value) pairs, sorted.
+    Attributes:
+        effect: its name.
+        location: a key of `Effect.locations`.
+        shape: (shape parameter, value) pairs, sorted; empty if the shape does not matter.
     """
 
     effect: str
@@ -23,7 +24,7 @@ class EffectKey:
     shape: tuple[tuple[str, float], ...] = ()
 
     def __str__(self) -> str:
-        """ "latch at door_hinge": for people; nothing reads it back."""
+        """Text for messages, such as "latch at door_hinge"."""
         return f"{self.effect} at {self.location}"
 
 
@@ -31,16 +32,19 @@ Keys = tuple[EffectKey, ...]  # the effects of a model
 
 
 def names_of(keys: Iterable[EffectKey]) -> str:
-    """ "latch at door_hinge + drag at door_hinge": for people."""
+    """Text for messages, such as "latch at door_hinge + drag at door_hinge"."""
     return " + ".join(map(str, keys))
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect at a location.
+    """An effect at a location, with values of its shape parameters.
 
-    coefficients: names of the parameters that make it.
-    shape_parameters: name -> value tried.
+    Attributes:
+        effect: its name.
+        location: a key of `Effect.locations`.
+        coefficients: names of its coefficients there.
+        shape_parameters: name -> value.
     """
 
     effect: str
@@ -50,12 +54,12 @@ class Candidate:
 
     @property
     def key(self) -> EffectKey:
-        """Which effect, and where."""
+        """The effect and the location."""
         return EffectKey(self.effect, self.location)
 
     @property
     def shaped_key(self) -> EffectKey:
-        """Which effect, where, and in which shape."""
+        """The effect, the location and the shape."""
         return EffectKey(self.effect, self.location, tuple(sorted(self.shape_parameters.items())))
 
     @property
@@ -65,15 +69,15 @@ class Candidate:
 
 
 def keys_of(parts: Iterable[Candidate]) -> Keys:
-    """Which effects, and where."""
+    """The effects and locations of candidates."""
     return tuple(part.key for part in parts)
 
 
 def candidates(effects: Iterable[Effect]) -> tuple[Candidate, ...]:
-    """Every effect at every location with every combination of its shape parameters' values.
+    """All effects at all their locations, with all combinations of their shape parameters' values.
 
     Raises:
-        ValueError: there is none at all.
+        ValueError: there are none.
     """
     out = []
     for effect in effects:

@@ -1,4 +1,4 @@
-"""Fingers and knob that give way more (or less) than the model's contact does."""
+"""A contact between fingers and knob that is softer (or stiffer) than the model's."""
 
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
@@ -16,13 +16,13 @@ def contact_compliance(scene: Scene) -> Effect | None:
     if scene.grip is None:
         return None
     pairs = [scene.id("pair", pair) for finger in scene.grip.fingers for pair in finger]
-    if (scene.model.pair_solref[pairs, 0] <= 0).any():  # stiffness and damping, and no time constant
+    if (scene.model.pair_solref[pairs, 0] <= 0).any():  # solref states stiffness and damping, no time constant
         return None
     writes = tuple(write(scene, "pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
     return Effect(
         "contact_compliance",
         (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 12.0, writes=writes, group=a.GROUP),),
-        description="fingertips or a knob that give way more than the model's",
+        description="fingertips or a knob that are softer than the model's",
         signature="grasp and breakaway, the peaks of the load",
         confused_with=("hinge_stribeck", "joint_compliance"),
         locations={"grip": (SOFTNESS,)},

@@ -25,7 +25,7 @@ def joint_directional(scene: Scene) -> Effect | None:
         a.of_joints(JOINT, joints, "N m", 0.2, 2.0),
         frictionloss=frictionloss,
         description="dry friction of a joint of the arm that differs between its two directions",
-        signature="an offset that comes and goes with the direction of that joint",
+        signature="an offset that depends on the direction of that joint's motion",
         confused_with=("joint_coulomb", "torque_bias"),
         locations=a.locations(joints, JOINT),
         minimum_size=0.03,
@@ -34,7 +34,7 @@ def joint_directional(scene: Scene) -> Effect | None:
 
 @register
 def hinge_directional(scene: Scene) -> Effect | None:
-    """The same on the hinge."""
+    """`joint_directional` on the object's hinge."""
     joint = a.hinge(scene)
     if joint is None:
         return None

@@ -1,4 +1,4 @@
-"""A door closer: a damper that works while the door closes."""
+"""A door closer: a damper that acts while the door closes."""
 
 import jax.numpy as jnp
 
@@ -12,7 +12,7 @@ DAMPING, EXPONENT = "closer_damping", "closer_exponent"
 
 @register
 def door_closer(scene: Scene) -> Effect | None:
-    """c w0 (|w| / w0)^n on the hinge where w < 0, w0 = 0.3 rad/s.  Its preload is the effect hinge_preload."""
+    """c w0 (|w| / w0)^n on the hinge for w < 0, w0 = 0.3 rad/s.  Its preload is the effect hinge_preload."""
     joint = a.hinge(scene)
     if joint is None:
         return None

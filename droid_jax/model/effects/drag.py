@@ -24,7 +24,7 @@ def drag(scene: Scene) -> Effect | None:
         (a.coefficient(DRAG, "N m s^2/rad^2", 0.5, 20.0, low=0.0),),
         force=force,
         description="drag of the door that grows with the square of its speed",
-        signature="the contrast between fast and slow stretches",
+        signature="the difference between fast and slow phases",
         confused_with=("door_closer", "opening_check"),
         locations={joint: (DRAG,)},
         minimum_size=0.1,

@@ -1,4 +1,4 @@
-"""A base that is not level: gravity points elsewhere than the model and the controller's compensation assume."""
+"""A base that is not level: gravity has another direction than in the model and in the gravity compensation."""
 
 import mujoco
 import numpy as np
@@ -10,20 +10,20 @@ from droid_jax.model.gravity import field_force, lean, placed
 from droid_jax.model.scene import Scene
 
 NAME = "gravity_about"
-FELT = 1e-3  # N m/rad: a lean that no measured joint of the arm feels more of is no candidate
-POSES = 20  # at which that is looked at
+LEAST_TORQUE = 1e-3  # N m/rad, an axis about which a tilt changes all joint torques by less is left out
+POSES = 20  # at which this is tested
 
 
 @register
 def gravity_direction(scene: Scene) -> Effect | None:
-    """sum J^T m (R g - g), R by two angles about the world's axes that lie most across gravity g, rad.
+    """sum J^T m (R g - g) over the arm's bodies; R turns gravity g about two world axes perpendicular to it, rad.
 
-    On the bodies that the arm carries; what an object hangs from is no part of the base (see `tilted_frame`).  The
-    gravity compensation goes on assuming an upright base, and so does what takes the weight out of a torque.
+    An object is not mounted on the base (see `tilted_frame`).  The gravity compensation, and the subtraction of gravity
+    from recorded torques, still assume an upright base.
     """
     if not a.arm(scene):
         return None
-    axes = [axis for axis in _across(scene) if _felt(scene, axis) > FELT]
+    axes = [axis for axis in _horizontal(scene) if _largest_torque(scene, axis) > LEAST_TORQUE]
     if not axes:
         return None
     names = [f"{NAME}_{'xyz'[axis]}" for axis in axes]
@@ -42,7 +42,7 @@ def gravity_direction(scene: Scene) -> Effect | None:
         "gravity_direction",
         tuple(a.coefficient(name, "rad", 0.01, 0.1) for name in names),
         force=force,
-        description="a base that is not level, which the gravity compensation takes for upright",
+        description="a base that is not level, while the gravity compensation assumes that it is",
         signature="all joints that carry weight, smooth in their angles, the same at every speed",
         confused_with=("encoder_offset", "payload", "cable_pull", "torque_bias"),
         locations={"base": tuple(names)},
@@ -50,26 +50,26 @@ def gravity_direction(scene: Scene) -> Effect | None:
     )
 
 
-def _across(scene: Scene) -> list[int]:
-    """The two axes of the world along which gravity is least."""
+def _horizontal(scene: Scene) -> list[int]:
+    """The two world axes along which gravity is smallest."""
     return sorted(np.argsort(np.abs(scene.model.opt.gravity), kind="stable")[:2].tolist())
 
 
 def _arm_side(scene: Scene) -> np.ndarray:
-    """[nv] 1 for degrees of freedom in the trees of the arm's joints, 0 from the object's joint on, and elsewhere."""
+    """[nv] 1 for degrees of freedom of the arm's kinematic trees without the object; 0 for others."""
     model = scene.model
     roots = {int(model.body_rootid[model.jnt_bodyid[scene.id("joint", j)]]) for j in a.arm(scene)}
-    behind = set[int]()
+    of_object = set[int]()
     if scene.object_joint is not None:
-        behind = {int(model.jnt_bodyid[scene.id("joint", scene.object_joint)])}
+        of_object = {int(model.jnt_bodyid[scene.id("joint", scene.object_joint)])}
         for body in range(1, model.nbody):
-            behind |= {body} if int(model.body_parentid[body]) in behind else set()
+            of_object |= {body} if int(model.body_parentid[body]) in of_object else set()
     bodies = model.dof_bodyid
-    return np.array([model.body_rootid[b] in roots and b not in behind for b in bodies], np.float32)
+    return np.array([model.body_rootid[b] in roots and b not in of_object for b in bodies], np.float32)
 
 
-def _felt(scene: Scene, axis: int) -> float:
-    """N m/rad, the most that a measured joint of the arm feels of a lean about an axis of the world."""
+def _largest_torque(scene: Scene, axis: int) -> float:
+    """N m/rad, largest torque at a measured joint of the arm for a tilt about a world axis."""
     model, data = scene.model.__copy__(), mujoco.MjData(scene.model)
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         return 0.0

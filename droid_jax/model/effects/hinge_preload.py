@@ -17,7 +17,7 @@ def hinge_preload(scene: Scene) -> Effect | None:
         return None
 
     def native(values, model):
-        """A spring pulls by as much more where its rest lies elsewhere; without a spring there is no such place."""
+        """The same torque by another rest angle of the hinge's spring; None without a spring."""
         stiffness = model.jnt_stiffness[scene.id("joint", joint)]
         return {("qpos_spring", scene.qpos(joint)): -values[NAME] / stiffness} if stiffness > 0 else None
 

@@ -1,4 +1,4 @@
-"""Dry friction of the arm's joints beyond what the model has."""
+"""Additional dry friction of the arm's joints."""
 
 from droid_jax.model.effect_interface import Effect, column
 from droid_jax.model.effects import coefficients as a
@@ -10,7 +10,7 @@ LOSS = "joint_coulomb"
 
 @register
 def joint_coulomb(scene: Scene) -> Effect | None:
-    """Fc sgn(qd) in a joint, N m: a constant added to its friction loss."""
+    """A constant Fc, N m, added to a joint's friction loss."""
     joints, dofs = a.arm(scene), a.arm_dofs(scene)
     if not joints:
         return None

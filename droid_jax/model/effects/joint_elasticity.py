@@ -1,12 +1,11 @@
-"""Gears that give way: elastic joints, and joints with backlash.
+"""Elastic joints, and joints with backlash.
 
-The servo measures the motor, the dynamics move the link.  Under a torque tau the motor stands at q + tau c in an
-elastic joint, and its encoder says so: that is the position that is recorded.  In a joint with backlash the motor turns
-freely within half of it to either side of the link, which is recorded.  Both are quasi-static: ringing is not
-simulated.
+The servo measures the motor's position, the dynamics move the link.  In an elastic joint with torque tau the motor is
+at q + tau c, which its encoder reads and a recording contains.  In a joint with backlash the motor turns freely by half
+of it to either side of the link, whose position is recorded.  Both are quasi-static: vibrations are not simulated.
 
-The torque is solved for with the servo's own law, whose gains and damping may be fitted.  Feeding back the torque of
-the step before would be simpler, but a stiff servo makes that a loop with a gain above one, which chatters.
+The torque is solved for with the servo's law, whose gains and damping may be fitted.  Using the torque of the previous
+step would be simpler, but with a stiff servo this is a loop with a gain above one, which chatters.
 """
 
 from __future__ import annotations
@@ -23,15 +22,20 @@ from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
-LEAST = 0.2  # of 1 + k c: a fitted servo may be stiffer than the one of which the bounds below zero are
+LEAST = 0.2  # lower limit of 1 + k c, since a fitted servo may be stiffer than the one from which bounds are computed
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
 
 
 @dataclass(frozen=True, eq=False)
 class _Servos:
-    """The arm's joints with a position servo: names, actuators, positions and degrees of freedom, all [J].
+    """The arm's joints with a position servo.
 
-    gear: [J].  stiffness: [J] N m/rad at the joint, as the MJCF has it.
+    Attributes:
+        joints: J names.
+        actuators: [J] ids.
+        positions, dofs: [J] position and velocity addresses.
+        gear: [J] transmission ratio.
+        stiffness: [J] N m/rad at the joint, of the MJCF.
     """
 
     joints: tuple[str, ...]
@@ -42,18 +46,18 @@ class _Servos:
     stiffness: np.ndarray
 
     def rigid_torque(self, state: State, ctrl: jax.Array) -> jax.Array:
-        """[J] N m with the motor where its link is."""
+        """[J] N m, servo torque with motors at the positions of their links."""
         gain, bias = self._law(state)
         length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
         feedback = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
         return jnp.asarray(self.gear) * (gain * ctrl[self.actuators] + feedback)
 
     def stiffness_in(self, state: State) -> jax.Array:
-        """[J] N m/rad at the joint, of the sample."""
+        """[J] N m/rad at the joint, of the sample's model."""
         return -self._law(state)[1][:, 1] * self.gear**2
 
     def with_lead(self, state: State, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
-        """[U] the command that has the same effect as motors ahead of their links by lead [J] rad."""
+        """[U] the command with the same effect as motors that are ahead of their links by lead [J] rad."""
         gain, _ = self._law(state)
         return ctrl.at[self.actuators].add(-self.stiffness_in(state) * lead / (self.gear * gain))
 
@@ -64,7 +68,7 @@ class _Servos:
 
 
 def _servos(scene: Scene) -> _Servos | None:
-    """None where no joint of the arm has a position servo: a torque does not care where its motor stands."""
+    """The arm's joints with a position servo; None if there are none, since other motors do not use their position."""
     model = scene.model
     fixed = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
     affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
@@ -88,9 +92,9 @@ def _servos(scene: Scene) -> _Servos | None:
 
 @register
 def joint_compliance(scene: Scene) -> Effect | None:
-    """Motor, and the encoder on it, ahead of the link by tau c, c = 1 / stiffness, rad/(N m).
+    """The motor and its encoder are ahead of the link by tau c, c = 1 / stiffness in rad/(N m).
 
-    What shows is c beside the servo's own 1 / k: of a soft servo only a softer gear does.
+    The data constrain c relative to the servo's 1 / k: with a soft servo only a softer gear is identifiable.
     """
     servos = _servos(scene)
     if servos is None:
@@ -116,7 +120,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
     usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
 
     def parameter(joint: str, stiffness: float):
-        # Below zero only so that a rigid joint is no edge; never so far that 1 + k c comes near zero.
+        # The lower bound is below zero so that a rigid joint is not at a bound; 1 + k c stays well above zero.
         high, low = max(1e-3, 0.3 / stiffness), -min(usual[joint], 0.5 / stiffness)
         return a.coefficient(f"{COMPLIANCE}[{joint}]", "rad/(N m)", usual[joint], high, low=low)
 
@@ -135,7 +139,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
 @register
 def joint_backlash(scene: Scene) -> Effect | None:
-    """Motor ahead of the link by half the backlash, rad, on the side that pushes; in between there is no torque."""
+    """The motor is ahead of the link by half the backlash, rad, in the direction of the torque, if there is any."""
     servos = _servos(scene)
     if servos is None:
         return None

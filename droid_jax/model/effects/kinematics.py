@@ -1,4 +1,4 @@
-"""Which way the links of an arm point, for forces that depend on it."""
+"""Orientations of an arm's links, for forces that depend on them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Turned = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 def turned(scene: Scene, body: int) -> Turned | None:
     """A function qpos [nq] -> axes [nv, 3] of the joints that carry a body, and its rotation [3, 3], in the world.
 
-    Axes of degrees of freedom that do not turn the body are zero.  None where a free or a ball joint carries it.
+    Axes of degrees of freedom that do not turn the body are zero.  None if a free or ball joint carries it.
     """
     model, links = scene.model, list[int]()
     while body:
@@ -35,9 +35,9 @@ def turned(scene: Scene, body: int) -> Turned | None:
             for joint in (j for j in joints if model.jnt_bodyid[j] == link):
                 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
                     continue
-                address, own = int(model.jnt_qposadr[joint]), np.asarray(model.jnt_axis[joint], np.float32)
-                axes = axes.at[int(model.jnt_dofadr[joint])].set(rotation @ own)
-                rotation = rotation @ _about(own, qpos[address] - model.qpos0[address])
+                address, axis = int(model.jnt_qposadr[joint]), np.asarray(model.jnt_axis[joint], np.float32)
+                axes = axes.at[int(model.jnt_dofadr[joint])].set(rotation @ axis)
+                rotation = rotation @ _about(axis, qpos[address] - model.qpos0[address])
         return axes, rotation
 
     return at

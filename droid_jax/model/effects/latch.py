@@ -1,4 +1,4 @@
-"""A magnetic catch, a ball catch or a latch: it holds the door in the first degrees only."""
+"""A magnetic catch, a ball catch or a latch, which holds the door in its first degrees only."""
 
 import jax.numpy as jnp
 
@@ -14,10 +14,10 @@ EXPONENTS = (0.6, 1.0, 2.0)
 
 @register
 def latch(scene: Scene) -> Effect | None:
-    """-A exp(-(phi/width)^n) on the hinge, phi >= 0: n = 1 far from a magnet, n = 2 a ball that leaves its seat.
+    """-A exp(-(phi/width)^n) on the hinge for phi >= 0: n = 1 for a magnet, n = 2 for a ball catch.
 
-    At phi = 0 the frame carries what closes the door further; the simulated one has no frame, so the
-    pull fades in over a tenth of the width.
+    A real frame stops the door at phi = 0.  The simulated door has no frame, so the pull increases from zero over a
+    tenth of the width.
     """
     joint = a.hinge(scene)
     if joint is None:

@@ -1,7 +1,7 @@
-"""Joint friction that grows with the torque a gear carries.
+"""Joint friction that grows with the torque of a gear.
 
-Source of the motor's and the links' shares and of the part that is higher at rest: Duclusaud et al., "Extended Friction
-Models for the Physics Simulation of Servo Actuators", ICRA 2025, models M3 to M5.
+Source of `gear_friction`: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators",
+ICRA 2025, models M3 to M5.
 """
 
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ SPEEDS = (0.1, 0.7)  # rad/s, over which the part at rest fades
 
 @register
 def load_friction(scene: Scene) -> Effect | None:
-    """K |tau| sgn(qd): a share K of the actuator's torque, on top of a joint's friction loss."""
+    """K |tau|, a share K of the actuator's torque, added to a joint's friction loss."""
     joints, dofs = a.arm(scene), a.arm_dofs(scene)
     if not joints:
         return None
@@ -41,11 +41,11 @@ def load_friction(scene: Scene) -> Effect | None:
 
 @register
 def gear_friction(scene: Scene) -> Effect | None:
-    """abs(E e - K m) + S exp(-abs(v/vs)) abs(e - m) on top of a joint's friction loss, for joints with an actuator.
+    """abs(E e - K m) + S exp(-abs(v/vs)) abs(e - m), added to the friction loss of joints with an actuator.
 
-    m is what the motor gives to its gear, e what the links put onto it (`State.gear`): where both press on the gear
-    from opposite sides their shares add up, where the load drives the motor they differ.  A joint's damping counts as
-    its motor's (back electromotive force).
+    m is the motor's torque on the gear, e that of the links (`State.gear`).  Their shares add up if the torques are
+    opposed, and are subtracted if the load drives the motor.  A joint's damping is part of its motor's torque (back
+    electromotive force).
     """
     joints = tuple(j for j in a.arm(scene) if j in scene.command_names)
     if not joints:
@@ -56,9 +56,9 @@ def gear_friction(scene: Scene) -> Effect | None:
         motor, links = state.gear[:, dofs]
         speed = state.qvel[dofs]
         motor = motor - state.model.dof_damping[dofs] * speed
-        carried = jnp.abs(column(theta, LINKS, joints) * links - column(theta, MOTOR, joints) * motor)
+        of_load = jnp.abs(column(theta, LINKS, joints) * links - column(theta, MOTOR, joints) * motor)
         slow = jnp.exp(-jnp.abs(speed / a.value(theta, SPEED, SPEEDS[-1])))
-        return base.at[dofs].add(carried + column(theta, AT_REST, joints) * slow * jnp.abs(links - motor))
+        return base.at[dofs].add(of_load + column(theta, AT_REST, joints) * slow * jnp.abs(links - motor))
 
     return Effect(
         GEAR,
@@ -67,8 +67,8 @@ def gear_friction(scene: Scene) -> Effect | None:
             a.shape(SPEED, "rad/s", SPEEDS, 0.02, 3.0),
         ),
         frictionloss=frictionloss,
-        description="friction of a gear that grows with what its motor and its load press on it",
-        signature="steps at that joint's reversals that grow with its torque, higher where it lifts and at low speed",
+        description="friction of a gear that grows with the torques of its motor and its load",
+        signature="steps at that joint's reversals that grow with its torque, higher when it lifts and at low speed",
         confused_with=(SHARE, "joint_stribeck", "joint_coulomb", "servo_gain"),
         special_cases=(SHARE,),
         locations=a.locations(joints, MOTOR, LINKS, AT_REST),

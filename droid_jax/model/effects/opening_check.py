@@ -9,13 +9,13 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
 DAMPING, ANGLE, EXPONENT = "check_damping", "check_angle", "check_exponent"
-ANGLES = (0.3, 0.5, 0.7)  # rad, where the braking begins
-SOFT = 0.05  # rad over which it sets in
+ANGLES = (0.3, 0.5, 0.7)  # rad, at which the braking begins
+SOFT = 0.05  # rad, over which it builds up
 
 
 @register
 def opening_check(scene: Scene) -> Effect | None:
-    """-c w0 (w / w0)^n on the hinge beyond phi_b while w > 0, w0 = 0.3 rad/s."""
+    """-c w0 (w / w0)^n on the hinge beyond phi_b for w > 0, w0 = 0.3 rad/s."""
     joint = a.hinge(scene)
     if joint is None:
         return None

@@ -1,4 +1,4 @@
-"""A self-closing hinge: its spring pulls hardest at a small angle and lets go further out."""
+"""A self-closing hinge: its spring pulls hardest at a small angle and less further out."""
 
 import jax.numpy as jnp
 
@@ -13,7 +13,7 @@ ANGLES = (0.1, 0.2, 0.35, 0.55)  # rad, of the peak: 5 to 30 degrees
 
 @register
 def over_centre_spring(scene: Scene) -> Effect | None:
-    """-A (phi/p) exp(1 - phi/p) on the hinge for phi > 0: zero when shut, A at phi = p, fading beyond."""
+    """-A (phi/p) exp(1 - phi/p) on the hinge for phi > 0: zero at phi = 0, A at phi = p, decreasing beyond."""
     joint = a.hinge(scene)
     if joint is None:
         return None

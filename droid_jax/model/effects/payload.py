@@ -1,4 +1,4 @@
-"""A tool or load that the arm's controller does not know of."""
+"""A tool or load at the hand whose weight the controller does not compensate."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,57 +17,57 @@ from droid_jax.model.parameters import Mode, Parameter, Role
 from droid_jax.model.scene import Scene
 
 MASS, MOMENT = "payload_mass", "payload_moment"
-POSES, FELT = 20, 1e-3  # poses at which it is looked at whether a moment weighs, m/s^2 that count
+POSES, LEAST_ACCELERATION = 20, 1e-3  # poses at which torques of a moment are tested, and the least m/s^2 that count
 LOAD, MOMENTS = "load_mass", tuple(f"load_moment_{axis}" for axis in "xyz")
 
 
 @register
 def payload(scene: Scene) -> Effect | None:
-    """m more kilograms at the centre of mass of the heaviest body behind the arm's last joint, and where they hang.
+    """A mass m, kg, at the centre of mass of the heaviest body after the arm's last joint, and its moment m r, kg m.
 
-    The gravity of the nominal mass goes on being compensated, that of the payload is not.  A load whose own centre lies
-    by r further out, on the line from the last joint to the body's centre, weighs with a moment m r more (kg m).  That
-    moment's inertia is left out: of a hand that turns by 1 rad/s^2 it is a tenth of what it weighs.
+    The gravity of the nominal mass is still compensated, that of the payload is not.  r is the distance of the load's
+    centre of mass from the body's, on the line from the last joint.  The inertia of the moment is neglected: at
+    1 rad/s^2 it is a tenth of its weight.
     """
     if (carried := _carried(scene)) is None:
         return None
     last, body = carried
-    more = _more_mass(scene, body, MASS, Role.PAYLOAD_MASS)
-    weighs = _weighs(scene, last, body)
-    parameters = (more,) if weighs is None else (more, a.coefficient(MOMENT, "kg m", 0.02, 0.3))
+    mass = _added_mass(scene, body, MASS, Role.PAYLOAD_MASS)
+    force = _outward_moment(scene, last, body)
+    parameters = (mass,) if force is None else (mass, a.coefficient(MOMENT, "kg m", 0.02, 0.3))
     return Effect(
         "payload",
         parameters,
-        force=weighs,
-        description="a tool or load that the arm's controller does not know of",
+        force=force,
+        description="a tool or load whose weight the controller does not compensate",
         signature="free motion: all joints in proportion to their lever",
         confused_with=("torque_bias", "cable_pull"),
         locations={last: tuple(p.name for p in parameters)},
         minimum_size=0.02,
-        native=lambda values, model: None if values.get(MOMENT) else {},  # a mass alone is written as such
+        native=lambda values, model: None if values.get(MOMENT) else {},  # the mass is a field of the model
     )
 
 
 @register
 def free_payload(scene: Scene) -> Effect | None:
-    """The same with its own centre anywhere: m r has three coordinates in the body's frame, from the body's centre.
+    """A payload with its centre of mass anywhere: m r is a vector in the body's frame, from the body's centre of mass.
 
-    Of these, those that some pose turns into a torque of a measured joint.
+    Coordinates that cause no torque at a measured joint in any pose are left out.
     """
     if (carried := _carried(scene)) is None:
         return None
     last, body = carried
-    felt = _felt(scene, body)
-    names = tuple(name for name, of in zip(MOMENTS, felt, strict=True) if of)
-    along = jnp.asarray(np.eye(3)[felt], jnp.float32)
-    force = _hangs(scene, body, lambda theta: jnp.stack([a.value(theta, name) for name in names]) @ along)
+    active = _active_axes(scene, body)
+    names = tuple(name for name, used in zip(MOMENTS, active, strict=True) if used)
+    basis = jnp.asarray(np.eye(3)[active], jnp.float32)
+    force = _weight_of_moment(scene, body, lambda theta: jnp.stack([a.value(theta, name) for name in names]) @ basis)
     if force is None or len(names) < 2:
         return None
     return Effect(
         "free_payload",
-        (_more_mass(scene, body, LOAD), *(a.coefficient(name, "kg m", 0.02, 0.3) for name in names)),
+        (_added_mass(scene, body, LOAD), *(a.coefficient(name, "kg m", 0.02, 0.3) for name in names)),
         force=force,
-        description="a tool or load with a centre off the hand's own line, that the controller does not know of",
+        description="a tool or load off the hand's axis, whose weight the controller does not compensate",
         signature="free motion: all joints, in proportion to levers that turn with the hand",
         confused_with=("payload", "gravity_direction", "torque_bias", "cable_pull"),
         special_cases=("payload",),
@@ -78,17 +78,17 @@ def free_payload(scene: Scene) -> Effect | None:
 
 
 def _carried(scene: Scene) -> tuple[str, int] | None:
-    """The arm's last joint and the body that a load hangs on; None where there is none with a mass."""
+    """The arm's last joint and the body that carries a load; None if there is no body with a mass."""
     joints = a.arm(scene)
     if not joints:
         return None
-    last = max(joints, key=lambda joint: scene.id("joint", joint))  # in the chain, whatever order the channels have
+    last = max(joints, key=lambda joint: scene.id("joint", joint))  # in the model's order, not the channels'
     body = _carrier(scene, last)
     return (last, body) if scene.model.body_mass[body] > 0 else None
 
 
-def _felt(scene: Scene, body: int) -> np.ndarray:
-    """[3] bool, axes of a body's frame along which a moment weighs on a measured joint of the arm in some pose."""
+def _active_axes(scene: Scene, body: int) -> np.ndarray:
+    """[3] bool, axes of a body's frame along which a moment causes a torque at a measured joint in some pose."""
     model, data = scene.model, mujoco.MjData(scene.model)
     rng, turning, most = np.random.default_rng(0), np.zeros((3, model.nv)), np.zeros(3)
     for _ in range(POSES):
@@ -97,14 +97,14 @@ def _felt(scene: Scene, body: int) -> np.ndarray:
         mujoco.mj_jacBody(model, data, None, turning, body)
         torques = np.cross(data.xmat[body].reshape(3, 3).T, model.opt.gravity) @ turning[:, a.arm_dofs(scene)]
         most = np.maximum(most, np.abs(torques).max(axis=1))
-    return most > FELT
+    return most > LEAST_ACCELERATION
 
 
-def _more_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> Parameter:
-    """Kilograms at a body's centre of mass, which nobody compensates.
+def _added_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> Parameter:
+    """A mass at a body's centre of mass, kg, without gravity compensation.
 
-    Of a body that is compensated, mass and compensation go by one share of the model's mass, so that the compensated
-    weight stays: beside a fitted mass they are kilograms of the model's.
+    For a compensated body the mass is scaled and gravcomp is divided by the same factor, so that the compensated weight
+    is unchanged.  If the body's mass is fitted too, the added mass is relative to the model's.
     """
     mass = float(scene.model.body_mass[body])
     share = dict(gain=1.0 / mass, offset=1.0)
@@ -112,21 +112,23 @@ def _more_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> P
     if scene.model.body_gravcomp[body] != 0:
         writes = [write(scene, "body_mass", (body,), Mode.SCALE, **share)]
         writes.append(write(scene, "body_gravcomp", (body,), Mode.DIVIDE, **share))
-    of_it: dict[str, Any] = dict(group=a.GROUP, role=role)
-    return Parameter(name, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **of_it)
+    options: dict[str, Any] = dict(group=a.GROUP, role=role)
+    return Parameter(name, "kg", 0.0, 0.2, -0.9 * min(mass, 1.0), 2.0, writes=tuple(writes), **options)
 
 
-def _weighs(scene: Scene, joint: str, body: int) -> Callable[[Theta, State], jax.Array] | None:
-    """What the moment of a load weighs on the joints; None where no line leads outwards, or the body flies."""
+def _outward_moment(scene: Scene, joint: str, body: int) -> Callable[[Theta, State], jax.Array] | None:
+    """Joint torques of a load's moment along `_outwards`; None without this direction, or if the body floats."""
     outwards = _outwards(scene, joint, body)
     if outwards is None:
         return None
-    along = jnp.asarray(outwards, jnp.float32)
-    return _hangs(scene, body, lambda theta: a.value(theta, MOMENT) * along)
+    direction = jnp.asarray(outwards, jnp.float32)
+    return _weight_of_moment(scene, body, lambda theta: a.value(theta, MOMENT) * direction)
 
 
-def _hangs(scene: Scene, body: int, moment: Callable[[Theta], jax.Array]) -> Callable[[Theta, State], jax.Array] | None:
-    """What a moment [3] kg m in a body's frame weighs on the joints; None where the body flies."""
+def _weight_of_moment(
+    scene: Scene, body: int, moment: Callable[[Theta], jax.Array]
+) -> Callable[[Theta, State], jax.Array] | None:
+    """Joint torques [nv] of the weight of a moment [3] kg m in a body's frame; None if the body floats."""
     links = turned(scene, body)
     if links is None:
         return None
@@ -140,7 +142,7 @@ def _hangs(scene: Scene, body: int, moment: Callable[[Theta], jax.Array]) -> Cal
 
 
 def _outwards(scene: Scene, joint: str, body: int) -> np.ndarray | None:
-    """[3] unit vector in a body's frame, from a joint that carries it to its centre; None where both coincide."""
+    """[3] unit vector in a body's frame, from a joint to the body's centre of mass; None if both coincide."""
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
     line = data.xmat[body].reshape(3, 3).T @ (data.xipos[body] - data.xanchor[scene.id("joint", joint)])
@@ -149,7 +151,7 @@ def _outwards(scene: Scene, joint: str, body: int) -> np.ndarray | None:
 
 
 def _carrier(scene: Scene, joint: str) -> int:
-    """Id of the heaviest body that moves with a joint and with no other one after it."""
+    """Id of the heaviest body that moves with a joint and with no later one."""
     model = scene.model
     last = int(model.jnt_bodyid[scene.id("joint", joint)])
     moving = [last]

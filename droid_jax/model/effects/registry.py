@@ -1,4 +1,4 @@
-"""The one list of effects: `register` adds to it, `library` makes what a scene can have."""
+"""The registry of effects: `register` adds to it, `library` makes the effects that a scene can have."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _MAKERS: dict[str, Maker] = {}
 
 
 def register(maker: Maker) -> Maker:
-    """Add a maker, Scene -> Effect or None where the scene cannot have it, under its function's name.
+    """Register a function Scene -> Effect (or None if the scene cannot have it) under its name.
 
-    Raises ValueError for a name that another function has taken.
+    Raises ValueError if another function has this name already.
     """
     name = maker.__name__
     known = _MAKERS.get(name)
@@ -37,7 +37,7 @@ def register(maker: Maker) -> Maker:
 
 
 def registered() -> tuple[str, ...]:
-    """Names of all effects, built in and added."""
+    """Names of all effects, of the library and of the user."""
     package = importlib.import_module("droid_jax.model.effects")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"{package.__name__}.{module.name}")
@@ -45,13 +45,19 @@ def registered() -> tuple[str, ...]:
 
 
 def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0) -> tuple[Effect, ...]:
-    """The effects that a scene can have, in the order of their names; `names` chooses some.
+    """The effects that a scene can have, in the order of their names.
 
-    scale: forces and torques of the built-in effects relative to a light arm's, see `sized`; those of your own have
-    the size they were given.
+    Args:
+        scene: of the effects.
+        names: of the effects; None: all.
+        scale: factor on forces and torques of built-in effects, whose sizes are those of a light arm (`sized`).  User
+            effects are not scaled.
 
-    Raises ValueError for unknown names, listing the valid ones, for an effect that is not well made, and for a scale
-    that is not above zero.
+    Returns:
+        The effects at neutral.
+
+    Raises:
+        ValueError: a name is unknown, an effect is invalid (`checked`), or the scale is not above zero.
     """
     check_scale(scale)
     known = registered()
@@ -59,12 +65,12 @@ def library(scene: Scene, names: Iterable[str] | None = None, scale: float = 1.0
     unknown = [n for n in chosen if n not in known]
     if unknown:
         raise ValueError(f"unknown effects {', '.join(unknown)}; valid: {', '.join(known)}")
-    made = (_made(_MAKERS[name], scene, scale) for name in chosen)
-    return tuple(effect for effect in made if effect is not None)
+    effects = (_made(_MAKERS[name], scene, scale) for name in chosen)
+    return tuple(effect for effect in effects if effect is not None)
 
 
 def check_scale(scale: float) -> None:
-    """ValueError for a scale of the built-in effects that is not above zero."""
+    """Raise ValueError for a scale of the built-in effects that is not above zero."""
     if not 0.0 < scale < np.inf:
         raise ValueError(f"the scale of the effects must be above 0, got {scale:g}")
 
@@ -74,7 +80,7 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
     if made is None:
         return None
     effect = checked(made)
-    if effect.name != maker.__name__:  # by which it is asked for, left out and loaded again
+    if effect.name != maker.__name__:  # options and files use the function's name
         raise ValueError(
             f"the effect that {maker.__name__!r} makes is called {effect.name!r}: give it the function's name"
         )
@@ -83,29 +89,30 @@ def _made(maker: Maker, scene: Scene, scale: float) -> Effect | None:
 
 
 def checked(effect: Effect) -> Effect:
-    """The effect; ValueError where it is not well made.
+    """The effect, if it is valid; else ValueError.
 
-    It must have the parameters that it speaks of, coefficients that are neutral at 0 and linear, and shapes whose
-    values to try lie within their bounds.
+    It must have the parameters that it names.  Coefficients must have mean 0 and linear scaling.  The values of shape
+    parameters must be within their bounds.
     """
-    own = {p.name: p for p in effect.parameters}
-    coefficients = [name for place in effect.locations.values() for name in place]
+    parameters = {p.name: p for p in effect.parameters}
+    coefficients = [name for of_location in effect.locations.values() for name in of_location]
     for name in (*coefficients, *effect.shape_parameters):
-        if name not in own:
+        if name not in parameters:
             raise ValueError(
-                f"effect {effect.name!r} speaks of a parameter {name!r} that it does not have; it has: {', '.join(own)}"
+                f"effect {effect.name!r} names a parameter {name!r} that it does not have; it has: "
+                f"{', '.join(parameters)}"
             )
-    for p, values in ((own[name], values) for name, values in effect.shape_parameters.items()):
-        if strange := [v for v in values if not p.low <= v <= p.high]:
+    for p, values in ((parameters[name], values) for name, values in effect.shape_parameters.items()):
+        if outside := [v for v in values if not p.low <= v <= p.high]:
             raise ValueError(
-                f"effect {effect.name!r}: values to try of its shape {p.name!r} lie outside its bounds "
-                f"[{p.low:g}, {p.high:g}]: {', '.join(f'{v:g}' for v in strange)}"
+                f"effect {effect.name!r}: values of its shape parameter {p.name!r} lie outside its bounds "
+                f"[{p.low:g}, {p.high:g}]: {', '.join(f'{v:g}' for v in outside)}"
             )
-    for p in (own[name] for name in coefficients):
-        if p.mean != 0.0:  # `Parameter` itself sees that the mean lies within the bounds
+    for p in (parameters[name] for name in coefficients):
+        if p.mean != 0.0:  # `Parameter` checks that the mean is within the bounds
             raise ValueError(
                 f"effect {effect.name!r}: a coefficient is neutral at 0, but {p.name!r} starts at {p.mean:g} {p.unit} "
-                f"with bounds [{p.low:g}, {p.high:g}]; let its bounds hold 0 and its mean be 0"
+                f"with bounds [{p.low:g}, {p.high:g}]; choose bounds that contain 0, and the mean 0"
             )
         if p.scaling is not Scaling.LINEAR:
             raise ValueError(f"effect {effect.name!r}: the coefficient {p.name!r} must be scaled linearly")
@@ -114,10 +121,10 @@ def checked(effect: Effect) -> Effect:
 
 @functools.lru_cache(maxsize=16)
 def ready(scene: Scene) -> Scene:
-    """The scene with a friction row for every joint whose friction an effect may raise; one for one scene.
+    """The scene with a constraint row for dry friction of each measured joint, which an effect may increase.
 
-    MJX lays these rows out at compilation (see TINY_FRICTIONLOSS); they cost a little time each.  Where the scene holds
-    friction (`Scene.hold`), they are as hard as those of joints with friction of their own.
+    MJX lays these rows out at compilation (see TINY_FRICTIONLOSS).  With `Scene.hold` they are hard, as those of joints
+    with friction in the MJCF.  The result is cached for each scene.
     """
     model = copy.copy(scene.model)
     dofs = [scene.dof(j) for j in scene.joints]
@@ -132,41 +139,40 @@ def ready(scene: Scene) -> Scene:
 
 
 def joined(base: Space, effects: Iterable[Effect]) -> Space:
-    """A base model's parameters, and then all of some effects'.
+    """The parameters of a base model, followed by those of effects.
 
-    Raises ValueError, with what to do, where one of the base has the name of an effect's.
+    Raises ValueError if a parameter of the base has the name of an effect's.
     """
     effects = tuple(effects)
-    whose = {p.name: effect.name for effect in effects for p in effect.parameters}
-    taken = [f"{name!r} (of the effect {whose[name]})" for name in base.names if name in whose]
+    effect_of = {p.name: effect.name for effect in effects for p in effect.parameters}
+    taken = [f"{name!r} (of the effect {effect_of[name]})" for name in base.names if name in effect_of]
     if taken:
         raise ValueError(
-            f"parameters have names that belong to effects of the library: {', '.join(taken)}; give yours others, in a "
-            'file of parameters with "name", or leave these effects away (gap --without)'
+            f"parameters have names that belong to effects of the library: {', '.join(taken)}; rename them (in a "
+            'parameter file with "name"), or leave these effects out (gap --without)'
         )
     return base + effect_space(effects)
 
 
 def beside(base: Space, effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Effects less their locations where the base has the sensor parameters that they would test.
+    """Effects without those, and without the locations, that parameters of the base model contain already.
 
-    A sensor's gain or an encoder's offset that is fitted as a parameter is no missing effect there, and neither is a
-    load on a body whose whole inertia is one.
+    These are gains and encoder offsets of sensors, and loads on a body whose whole inertia is a parameter.
     """
     whole = {w.index[0] for p in base.parameters for w in p.writes if w.field == PSEUDO_INERTIA}
     taken = {f"{term}[{joint}]" for term in (GAIN, ENCODER) for joint in _joints_of(base)} & {*base.names}
-    found = []
+    remaining = []
     for effect in effects:
         if any(w.field in WEIGHTS and w.index[0] in whole for p in effect.parameters for w in p.writes):
             continue
         if not taken & {p.name for p in effect.parameters}:
-            found.append(effect)
+            remaining.append(effect)
             continue
-        places = {at: names for at, names in effect.locations.items() if not taken & {*names}}
-        if places:
-            left = tuple(p for p in effect.parameters if p.name not in taken)
-            found.append(replace(effect, locations=places, parameters=left))
-    return tuple(found)
+        locations = {at: names for at, names in effect.locations.items() if not taken & {*names}}
+        if locations:
+            parameters = tuple(p for p in effect.parameters if p.name not in taken)
+            remaining.append(replace(effect, locations=locations, parameters=parameters))
+    return tuple(remaining)
 
 
 def _joints_of(base: Space) -> set[str]:
@@ -174,5 +180,5 @@ def _joints_of(base: Space) -> set[str]:
 
 
 def effect_space(effects: Iterable[Effect]) -> Space:
-    """All parameters of some effects; its mean is neutral."""
+    """All parameters of effects; its mean is neutral."""
     return Space(tuple(p for effect in effects for p in effect.parameters))

@@ -1,4 +1,4 @@
-"""Servo gains other than the stated ones."""
+"""Servo gains that differ from the stated ones."""
 
 from dataclasses import replace
 

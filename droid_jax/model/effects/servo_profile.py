@@ -1,6 +1,6 @@
-"""The path that a servo draws by itself between two goals: limits of its acceleration and of its speed.
+"""Profiles of a servo between two goals: limits of acceleration and speed.
 
-Hobby servos and industrial controllers turn a goal into a ramp before their position loop sees it.
+Hobby servos and industrial controllers convert a goal into a ramp for their position loop.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ACCELERATION, SPEED = "profile_acceleration", "profile_speed"
 
 @register
 def profile_acceleration(scene: Scene) -> Effect | None:
-    """The servo's own goal accelerates by at most 1/p and brakes in time; p in s^2/rad, none at zero."""
+    """The servo's reference accelerates by at most 1/p and brakes in time; p in s^2/rad, 0: no limit."""
     joints = _servos(scene)
     if not joints:
         return None
@@ -31,12 +31,12 @@ def profile_acceleration(scene: Scene) -> Effect | None:
         most = 1.0 / jnp.where(limit > 0.0, limit, 1.0)
 
         def follow(state, goal):
-            place, speed = state
-            way = goal - place
+            at, speed = state
+            way = goal - at
             wanted = jnp.sign(way) * jnp.minimum(jnp.abs(way) / timestep, jnp.sqrt(2.0 * most * jnp.abs(way)))
             speed = speed + jnp.clip(wanted - speed, -most * timestep, most * timestep)
-            place = place + timestep * speed
-            return (place, speed), place
+            at = at + timestep * speed
+            return (at, speed), at
 
         return jnp.where(limit > 0.0, _followed(follow, command), command)
 
@@ -45,8 +45,8 @@ def profile_acceleration(scene: Scene) -> Effect | None:
         a.of_joints(ACCELERATION, joints, "s^2/rad", 0.02, 1.0, low=0.0),
         profile=profile,
         profile_limits="acceleration",
-        description="a servo that limits how fast its goal speeds up",
-        signature="fast changes of that joint's command: amplitudes that fall, and lag that grows, with its frequency",
+        description="a servo that limits the acceleration of its reference",
+        signature="fast changes of that joint's command: amplitude falls and lag grows with frequency",
         confused_with=("velocity_feedforward", "command_delay", "servo_gain", SPEED),
         locations=a.locations(joints, ACCELERATION),
         minimum_size=0.002,
@@ -55,7 +55,7 @@ def profile_acceleration(scene: Scene) -> Effect | None:
 
 @register
 def profile_speed(scene: Scene) -> Effect | None:
-    """The servo's own goal moves by at most 1/p; p in s/rad, no limit at zero."""
+    """The servo's reference moves at a speed of at most 1/p; p in s/rad, 0: no limit."""
     joints = _servos(scene)
     if not joints:
         return None
@@ -65,19 +65,20 @@ def profile_speed(scene: Scene) -> Effect | None:
         most = timestep / jnp.where(limit > 0.0, limit, 1.0)
 
         def follow(state, goal):
-            place, speed = state
-            place = place + jnp.clip(goal - place, -most, most)
-            return (place, speed), place
+            at, speed = state
+            at = at + jnp.clip(goal - at, -most, most)
+            return (at, speed), at
 
         return jnp.where(limit > 0.0, _followed(follow, command), command)
 
     return Effect(
         SPEED,
-        # The score test tries a share of the deviation, 1.5 s/rad: a higher limit would never act on slow commands.
+        # The score test evaluates at a share of the deviation, 1.5 s/rad.  Higher speed limits do not act on slow
+        # commands.
         a.of_joints(SPEED, joints, "s/rad", 5.0, 20.0, low=0.0),
         profile=profile,
         profile_limits="speed",
-        description="a servo that limits how fast its goal moves",
+        description="a servo that limits the speed of its reference",
         signature="large steps of that joint's command, which become ramps of one slope",
         confused_with=("command_delay", "servo_gain", ACCELERATION),
         locations=a.locations(joints, SPEED),
@@ -86,7 +87,7 @@ def profile_speed(scene: Scene) -> Effect | None:
 
 
 def _followed(follow, command: jax.Array) -> jax.Array:
-    """[T, U] the places of a goal that sets out from rest at the first command [T, U]."""
+    """[T, U] positions of a reference that starts at rest at the first command [T, U]."""
     return jax.lax.scan(follow, (command[0], jnp.zeros_like(command[0])), command)[1]
 
 

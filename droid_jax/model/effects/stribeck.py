@@ -23,7 +23,7 @@ def _excess(theta, speed_name: str, exponent_name: str, velocity):
 
 @register
 def joint_stribeck(scene: Scene) -> Effect | None:
-    """(Fs - Fc) exp(-|v/vs|^n) on top of a joint's friction loss, N m."""
+    """(Fs - Fc) exp(-|v/vs|^n), N m, added to a joint's friction loss."""
     joints, dofs = a.arm(scene), a.arm_dofs(scene)
     if not joints:
         return None
@@ -43,7 +43,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
         description="friction of a joint of the arm that is higher at rest than in motion",
         signature="breakaway and reversals of that joint",
         confused_with=("joint_coulomb",),
-        special_cases=("joint_coulomb",),  # a speed beyond all that the joint has
+        special_cases=("joint_coulomb",),  # for vs above the joint's largest speed
         locations=a.locations(joints, JOINT),
         shape_parameters={JOINT_SPEED: SPEEDS, JOINT_EXPONENT: a.EXPONENTS},
         minimum_size=0.05,
@@ -52,7 +52,7 @@ def joint_stribeck(scene: Scene) -> Effect | None:
 
 @register
 def hinge_stribeck(scene: Scene) -> Effect | None:
-    """The same on the hinge."""
+    """`joint_stribeck` on the object's hinge."""
     joint = a.hinge(scene)
     if joint is None:
         return None

@@ -1,4 +1,4 @@
-"""A door frame out of plumb: gravity opens or closes the door."""
+"""A tilted door frame: gravity opens or closes the door."""
 
 import jax.numpy as jnp
 
@@ -12,7 +12,7 @@ SINE, COSINE = "tilt_sine", "tilt_cosine"
 
 @register
 def tilted_frame(scene: Scene) -> Effect | None:
-    """-(A sin phi + B cos phi) on the hinge, N m: m g d sin(alpha) for a lean to the front and to the side."""
+    """-(A sin phi + B cos phi) on the hinge, N m: m g d sin(alpha) for tilts forward and sideways."""
     joint = a.hinge(scene)
     if joint is None:
         return None
@@ -28,7 +28,7 @@ def tilted_frame(scene: Scene) -> Effect | None:
         description="a frame out of plumb, so that gravity moves the door",
         signature="smooth over the angle, the same at every speed and in both directions",
         confused_with=("hinge_preload", "hardening_spring"),
-        special_cases=("hinge_preload",),  # its cosine, over a small angle
+        special_cases=("hinge_preload",),  # A = 0, over a small range of angles
         locations={joint: (SINE, COSINE)},
         minimum_size=0.05,
     )

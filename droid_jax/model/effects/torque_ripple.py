@@ -8,15 +8,15 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
 SINE, COSINE, PERIODS = "ripple_sine", "ripple_cosine", "ripple_periods"
-# Periods a turn.  Between two of them the phase drifts by four radians over one radian of motion: were it more, a
-# ripple between two counts would look like neither.  Fewer than FEWEST make a curve that mimics anything smooth.
+# Periods per turn.  Between two of these values the phase differs by four radians over one radian of motion.  A wider
+# spacing would miss ripples in between.  Fewer than LEAST_COUNT periods can imitate any smooth law.
 COUNTS = tuple(float(n) for n in range(12, 61, 4))
-FEWEST = 10.0
+LEAST_COUNT = 10.0
 
 
 @register
 def torque_ripple(scene: Scene) -> Effect | None:
-    """A sin(n q) + B cos(n q) in a joint, N m; n periods a turn."""
+    """A sin(n q) + B cos(n q) in a joint, N m; n periods per turn."""
     joints, positions = a.arm(scene), a.arm_qpos(scene)
     if not joints:
         return None
@@ -33,7 +33,7 @@ def torque_ripple(scene: Scene) -> Effect | None:
         (
             *a.of_joints(SINE, joints, "N m", 0.1, 1.0),
             *a.of_joints(COSINE, joints, "N m", 0.1, 1.0),
-            a.shape(PERIODS, "1/turn", COUNTS, FEWEST, 80.0),
+            a.shape(PERIODS, "1/turn", COUNTS, LEAST_COUNT, 80.0),
         ),
         force=force,
         description="torque ripple of a joint's motor or gear",

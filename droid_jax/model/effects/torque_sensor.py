@@ -1,4 +1,4 @@
-"""Errors of the torque sensors: an offset, a wrong gain, a drift over the recording, a neighbour's torque."""
+"""Errors of torque sensors: an offset, a gain error, a drift over the recording, crosstalk."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def torque_gain(scene: Scene) -> Effect | None:
 
 @register
 def torque_drift(scene: Scene) -> Effect | None:
-    """tau + d (t - t_end / 2), N m/s: without a mean, so that it is no offset."""
+    """tau + d (t - t_end / 2), d in N m/s; the drift has zero mean, so that it is no offset."""
 
     def observe(theta, rollout):
         middle = rollout.time - 0.5 * (rollout.time[0] + rollout.time[-1])
@@ -61,7 +61,7 @@ def torque_drift(scene: Scene) -> Effect | None:
         a.of_joints(DRIFT, scene.joints, "N m/s", 0.02, 0.3),
         observe=observe,
         description="a torque sensor that drifts during a recording",
-        signature="one joint, growing steadily with time whatever moves",
+        signature="one joint, growing steadily with time in any motion",
         confused_with=("torque_bias", "cable_pull"),
         locations=a.locations(scene.joints, DRIFT),
         minimum_size=0.005,
@@ -71,29 +71,30 @@ def torque_drift(scene: Scene) -> Effect | None:
 
 @register
 def torque_crosstalk(scene: Scene) -> Effect | None:
-    """tau_i + b tau_(i-1) + c tau_(i+1): shares of the torques of the channels next to a joint's own."""
+    """tau_i + b tau_(i-1) + c tau_(i+1), shares of the neighbouring channels' torques."""
     joints = a.arm(scene)
     if len(joints) < 2:
         return None
 
     def observe(theta, rollout):
         rows = [scene.joints.index(joint) for joint in joints]
-        own = rollout.torque[:, rows]
-        none = jnp.zeros_like(own[:, :1])
-        before, after = jnp.concatenate([none, own[:, :-1]], axis=1), jnp.concatenate([own[:, 1:], none], axis=1)
-        leaks = column(theta, BEFORE, joints) * before + column(theta, AFTER, joints) * after
-        return replace(rollout, torque=jnp.asarray(rollout.torque).at[:, rows].add(leaks))
+        torque = rollout.torque[:, rows]
+        none = jnp.zeros_like(torque[:, :1])
+        before = jnp.concatenate([none, torque[:, :-1]], axis=1)
+        after = jnp.concatenate([torque[:, 1:], none], axis=1)
+        leakage = column(theta, BEFORE, joints) * before + column(theta, AFTER, joints) * after
+        return replace(rollout, torque=jnp.asarray(rollout.torque).at[:, rows].add(leakage))
 
     names = {joint: (f"{BEFORE}[{joint}]", f"{AFTER}[{joint}]") for joint in joints}
-    places = {j: tuple(n for n, there in zip(names[j], (i > 0, i + 1 < len(joints)), strict=True) if there)
-              for i, j in enumerate(joints)}  # fmt: skip
+    locations = {j: tuple(n for n, exists in zip(names[j], (i > 0, i + 1 < len(joints)), strict=True) if exists)
+                 for i, j in enumerate(joints)}  # fmt: skip
     return Effect(
         CROSSTALK,
-        tuple(a.coefficient(name, "-", 0.03, 0.3) for of in places.values() for name in of),
+        tuple(a.coefficient(name, "-", 0.03, 0.3) for of_joint in locations.values() for name in of_joint),
         observe=observe,
         description="a joint's torque sensor that also reads its neighbours' torques",
-        signature="one joint, in proportion to the torque of the next or the last",
+        signature="one joint, in proportion to the torque of a neighbouring joint",
         confused_with=("torque_gain", "torque_bias"),
-        locations=places,
+        locations=locations,
         minimum_size=0.01,
     )

@@ -1,4 +1,4 @@
-"""The compiled replays that the tests of the effects share."""
+"""Compiled replays that the tests of the effects share."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from droid_jax.model.effect_interface import Rollout
 
 @pytest.fixture(scope="session")
 def small() -> Bench:
-    """The small scene with its whole library."""
+    """The small scene with all its effects."""
     return mechanism_bench()
 
 
 @pytest.fixture(scope="session")
 def small_bare(small: Bench) -> Rollout:
-    """The small scene without any effect."""
+    """The small scene without effects."""
     return bare(small)
 
 
 @pytest.fixture(scope="session")
 def real() -> Bench:
-    """The door scene with its whole library; for slow tests."""
+    """The door scene with all its effects; for slow tests."""
     return door_bench()

@@ -1,4 +1,4 @@
-"""What the tests of the effects share: two scenes, and one compiled replay that holds a scene's whole library."""
+"""Shared by the tests of the effects: two scenes, each with one compiled replay that has all its effects."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Bench:
 
 
 def make_bench(scene: Scene, drive: Drive, effects: Sequence[Effect] | None = None, *, parity: bool = False) -> Bench:
-    """Compile a scene's whole library, or some effects."""
+    """Compile a scene with all its effects, or with some."""
     effects = library(scene) if effects is None else tuple(effects)
     space = effect_space(effects)
     replay = servo_replay(scene, drive, effects, parity=parity)
@@ -76,9 +76,9 @@ def make_bench(scene: Scene, drive: Drive, effects: Sequence[Effect] | None = No
 
 
 def bare(bench: Bench, *, parity: bool = False) -> Rollout:
-    """The same scene and commands compiled without any effect, [T, ...].
+    """The same scene and commands compiled without effects, [T, ...].
 
-    The model is the scene's own: writing every parameter of the library into it would compile as long again.
+    No parameter of an effect is written into the model, which would compile as long again.
     """
     replay = servo_replay(bench.scene, bench.drive, parity=parity)
     outside = Space(tuple(p for p in bench.space.parameters if not p.writes))
@@ -92,18 +92,18 @@ def typical(parameter: Parameter) -> float:
 
 
 def coefficients(effect: Effect) -> list[Parameter]:
-    """Of all places."""
+    """Coefficients of all locations."""
     names = {n for place in effect.locations.values() for n in place}
     return [p for p in effect.parameters if p.name in names]
 
 
 def everywhere(effect: Effect, value: Callable[[Parameter], float] = typical) -> dict[str, float]:
-    """All coefficients of an effect at the value that a function gives them."""
+    """All coefficients of an effect, with the value that a function gives."""
     return {p.name: value(p) for p in coefficients(effect)}
 
 
 def motion(time: np.ndarray) -> np.ndarray:
-    """[T, 3] rad, of JOINTS: reversals everywhere; the door opens fast, closes slowly, and beyond shut a little."""
+    """[T, 3] rad, of JOINTS: reversals everywhere; the door opens fast, closes slowly and passes zero slightly."""
     phase = 1.9 * time + 0.35 * np.sin(1.9 * time)
     shoulder = 0.6 * np.sin(1.6 * time) + 0.1 * np.sin(4.1 * time)
     elbow = 0.3 + 0.5 * np.sin(2.5 * time)
@@ -112,13 +112,13 @@ def motion(time: np.ndarray) -> np.ndarray:
 
 
 def mechanism(timestep: float = 0.005) -> Scene:
-    """The small scene with a friction row for every joint."""
+    """The small scene with a friction row for each joint."""
     scene = compile_scene(mujoco.MjSpec.from_string(MECHANISM), "mechanism", joints=JOINTS, object_joint="door")
     return ready(with_options(scene, timestep=timestep))
 
 
 def mechanism_bench(timestep: float = 0.005, *, parity: bool = False) -> Bench:
-    """The small scene with its motion as commands, starting on them."""
+    """The small scene with its motion as commands, from their first row."""
     scene = mechanism(timestep)
     path = motion(np.arange(round(SECONDS / timestep)) * timestep)
     command = path[:, [JOINTS.index(j) for j in scene.command_names]]
@@ -127,12 +127,12 @@ def mechanism_bench(timestep: float = 0.005, *, parity: bool = False) -> Bench:
 
 
 def door(gains: str = "impedance") -> Scene:
-    """The built-in scene with a friction row for every joint."""
+    """The built-in scene with a friction row for each joint."""
     return ready(door_scene(springs=1, timestep=0.004, gains=gains))
 
 
 def door_bench(gains: str = "impedance", names: Sequence[str] | None = None, motion: str = "A") -> Bench:
-    """The built-in scene, one of its demonstrations, and its library or some of it; for slow tests."""
+    """The built-in scene, one of its demonstrations, and all or some of its effects; for slow tests."""
     scene = door(gains)
     drive = make_drive(scene, load_recording(demonstration_path(motion, gains=gains)))
     return make_bench(scene, drive, library(scene, names))

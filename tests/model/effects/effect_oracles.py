@@ -1,4 +1,4 @@
-"""What each effect promises, written a second time: as a change of the MJCF, or as a formula in numpy."""
+"""The law of each effect, written a second time: as a change of the MJCF, or as a formula in numpy."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def at_door(torque: Callable[[Values, float, float], float]) -> Callable[[Values
 
 
 def at_arm(torque: Callable[[Values, str, Now], float]) -> Callable[[Values, Now], ByJoint]:
-    """A function of a joint and the moment; `v` holds that joint's parameters without its name in brackets."""
+    """A function of a joint and the moment; `v` contains that joint's parameters, by names without brackets."""
 
     def of_arm(v: Values, now: Now) -> ByJoint:
         own = {j: {n.removesuffix(f"[{j}]"): number for n, number in v.items()} for j in ARM}
@@ -90,8 +90,8 @@ def at_arm(torque: Callable[[Values, str, Now], float]) -> Callable[[Values, Now
 # ----- the MJCF's own means
 
 
-def rest_elsewhere(spec: mujoco.MjSpec, v: Values) -> None:
-    """A constant torque is a spring whose rest lies elsewhere."""
+def rest_angle(spec: mujoco.MjSpec, v: Values) -> None:
+    """A constant torque is a spring with another rest angle."""
     joint = spec.joint("door")
     joint.springref = -v["hinge_preload"] / joint.stiffness[0]
 
@@ -101,30 +101,30 @@ def more_frictionloss(spec: mujoco.MjSpec, v: Values) -> None:
         spec.joint(joint).frictionloss += v[f"joint_coulomb[{joint}]"]
 
 
-def lump(spec: mujoco.MjSpec, v: Values, mass: str = "payload_mass") -> None:
-    """A body at the hand's centre of mass, which nobody compensates."""
-    spec.body("hand").add_body(name="lump").add_geom(
+def added_mass(spec: mujoco.MjSpec, v: Values, mass: str = "payload_mass") -> None:
+    """A body at the hand's centre of mass, without gravity compensation."""
+    spec.body("hand").add_body(name="added_mass").add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], mass=v[mass], contype=0, conaffinity=0
     )
 
 
-def hangs_further_out(v: Values, now: Now) -> ByJoint:
-    """The hand's centre lies straight below the elbow where all angles are zero, and so does what hangs further out."""
+def outward_moment(v: Values, now: Now) -> ByJoint:
+    """With all angles zero the hand's centre of mass is straight below the elbow, and so is that of the load."""
     leans = now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
     return dict.fromkeys(ARM, -GRAVITY * v["payload_moment"] * np.sin(leans))
 
 
-def hangs_anywhere(v: Values, now: Now) -> ByJoint:
-    """A moment in the plane of the links, along the hand's x and z, which are the world's where all angles are zero."""
+def free_moment(v: Values, now: Now) -> ByJoint:
+    """A moment in the plane of the links, along the hand's x and z, which are the world's with all angles zero."""
     leans = now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
     outwards = v["load_moment_x"] * np.cos(leans) + v["load_moment_z"] * np.sin(leans)  # along the world's x
     return dict.fromkeys(ARM, GRAVITY * outwards)
 
 
-def leaning(v: Values, now: Now) -> ByJoint:
-    """Gravity turned about y pushes the arm's masses along x (and less downwards), nobody compensates the difference.
+def tilted_gravity(v: Values, now: Now) -> ByJoint:
+    """Gravity turned about y pushes the arm's masses along x (and less downwards), without compensation.
 
-    Every mass hangs straight below its joint where all angles are zero.
+    With all angles zero each centre of mass is straight below its joint.
     """
     shift = GRAVITY * np.array([-np.sin(v["gravity_about_y"]), 1 - np.cos(v["gravity_about_y"])])  # along x and z
 
@@ -137,7 +137,7 @@ def leaning(v: Values, now: Now) -> ByJoint:
 
 
 def compensated_elsewhere(v: Values, now: Now) -> ByJoint:
-    """What carries forearm and hand where the encoders have them, less what carries them where they are."""
+    """Compensation of forearm and hand at the encoders' readings, minus that at the true positions."""
     off = {j: v[f"encoder_offset[{j}]"] for j in ARM}
     upper, lower = now.q["shoulder"], now.q["shoulder"] + now.q["elbow"] - ELBOW_REFERENCE
 
@@ -150,7 +150,7 @@ def compensated_elsewhere(v: Values, now: Now) -> ByJoint:
 
 
 def turned_encoders(spec: mujoco.MjSpec, v: Values) -> None:
-    """Joints are where they are at lower readings."""
+    """The same joint positions have lower readings."""
     for name in ARM:
         joint = spec.joint(name)
         joint.ref, joint.springref = joint.ref - v[f"encoder_offset[{name}]"], -v[f"encoder_offset[{name}]"]
@@ -180,23 +180,23 @@ def stribeck(v: Values, name: str, height: float, speed: float) -> float:
     return height * np.exp(-(abs(speed / v[f"{name}_speed"]) ** v[f"{name}_exponent"]))
 
 
-def geared(v: Values, joint: str, now: Now) -> float:
-    """Shares of what presses on the gear from both sides, and what comes on top while the joint is slow."""
+def gear_friction(v: Values, joint: str, now: Now) -> float:
+    """Shares of the torques on both sides of the gear, and an additional part at low speed."""
     motor, links = now.motor[joint], now.links[joint]
     slow = np.exp(-abs(now.w[joint]) / v["gear_speed"])
     return abs(v["gear_links"] * links - v["gear_motor"] * motor) + v["gear_at_rest"] * slow * abs(links - motor)
 
 
-def looking_ahead(v: Values, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
-    """Each servo is given its command and a share of the command's speed over the last 10 ms."""
+def feedforward(v: Values, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
+    """Each servo gets its command and a share of the command's speed over the last 10 ms."""
     command, speed = look(at), (look(at) - look(at - 0.01)) / 0.01
     for joint in ARM:
         command[:, servos[joint]] += v[f"velocity_feedforward[{joint}]"] * speed[:, servos[joint]]
     return command
 
 
-def in_ramps(v: Values, name: str, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
-    """A goal of each joint that follows the command on the replay's clock, within its limit."""
+def limited_profile(v: Values, name: str, at: np.ndarray, look: Look, servos: Mapping[str, int]) -> np.ndarray:
+    """The reference of each joint follows the command on the replay's clock, within its limit."""
     h = at[1] - at[0]
     time = h * np.arange(len(at))
     command = look(time)
@@ -214,7 +214,7 @@ def in_ramps(v: Values, name: str, at: np.ndarray, look: Look, servos: Mapping[s
     return np.stack([np.interp(at, time, column) for column in command.T], axis=1)
 
 
-def leaking(v: Values, t: np.ndarray, torque: np.ndarray) -> np.ndarray:
+def crosstalk(v: Values, t: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Shoulder and elbow, the first two channels, read each other."""
     shoulder = torque[:, 0] + v["crosstalk_after[shoulder]"] * torque[:, 1]
     elbow = torque[:, 1] + v["crosstalk_before[elbow]"] * torque[:, 0]
@@ -222,7 +222,7 @@ def leaking(v: Values, t: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def latch(v: Values, phi: float, w: float) -> float:
-    """The pull fades in over a tenth of the width; a door beyond shut is not pulled."""
+    """The pull builds up over a tenth of the width; there is none beyond closed."""
     share = max(phi, 0.0) / v["latch_width"]
     return -v["latch_torque"] * np.exp(-(share ** v["latch_exponent"])) * (1 - np.exp(-10 * share))
 
@@ -263,14 +263,14 @@ ORACLES = {
     ),
     "free_payload": Oracle(
         {"load_mass": 0.2, "load_moment_x": 0.05, "load_moment_z": -0.02},
-        edit=lambda spec, v: lump(spec, v, "load_mass"),
-        beside=hangs_anywhere,
+        edit=lambda spec, v: added_mass(spec, v, "load_mass"),
+        beside=free_moment,
     ),
     "gear_friction": Oracle(
         {**each(*ARM, gear_motor=(0.1, 0.15), gear_links=(0.05, 0.2), gear_at_rest=(0.1, 0.05)), "gear_speed": 0.4},
-        loss=at_arm(geared),
+        loss=at_arm(gear_friction),
     ),
-    "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=leaning, joints=ARM),
+    "gravity_direction": Oracle({"gravity_about_y": 0.04}, force=tilted_gravity, joints=ARM),
     "hardening_spring": Oracle(
         {"hardening_square": 1.5, "hardening_cube": -0.8},
         force=at_door(lambda v, phi, w: -v["hardening_square"] * phi * abs(phi) - v["hardening_cube"] * phi**3),
@@ -279,7 +279,7 @@ ORACLES = {
         {"hinge_directional": -0.3}, loss=at_door(lambda v, phi, w: v["hinge_directional"] * np.tanh(w / SLOW))
     ),
     "hinge_preload": Oracle(
-        {"hinge_preload": 0.7}, edit=rest_elsewhere, force=at_door(lambda v, phi, w: -v["hinge_preload"])
+        {"hinge_preload": 0.7}, edit=rest_angle, force=at_door(lambda v, phi, w: -v["hinge_preload"])
     ),
     "hinge_stribeck": Oracle(
         {"hinge_stribeck": 0.8, "hinge_stribeck_speed": 0.06, "hinge_stribeck_exponent": 1.3},
@@ -310,14 +310,14 @@ ORACLES = {
     ),
     "opening_check": Oracle({"check_damping": 2.5, "check_angle": 0.4, "check_exponent": 1.7}, force=at_door(check)),
     "over_centre_spring": Oracle({"over_centre_torque": 1.5, "over_centre_angle": 0.25}, force=at_door(over_centre)),
-    "payload": Oracle({"payload_mass": 0.3, "payload_moment": -0.04}, edit=lump, beside=hangs_further_out),
+    "payload": Oracle({"payload_mass": 0.3, "payload_moment": -0.04}, edit=added_mass, beside=outward_moment),
     "profile_acceleration": Oracle(
         each(*ARM, profile_acceleration=(0.5, 0.4)),
-        sent=lambda v, at, look, servos: in_ramps(v, "profile_acceleration", at, look, servos),
+        sent=lambda v, at, look, servos: limited_profile(v, "profile_acceleration", at, look, servos),
     ),
     "profile_speed": Oracle(
         each(*ARM, profile_speed=(1.5, 1.2)),
-        sent=lambda v, at, look, servos: in_ramps(v, "profile_speed", at, look, servos),
+        sent=lambda v, at, look, servos: limited_profile(v, "profile_speed", at, look, servos),
     ),
     "sensor_delay": Oracle(
         {"sensor_delay": 0.0077},
@@ -337,7 +337,7 @@ ORACLES = {
     "torque_bias": Oracle(
         each(*JOINTS, torque_bias=(0.3, -0.2, 0.1)), read=lambda v, t, torque: torque + of_joints(v, "torque_bias")
     ),
-    "torque_crosstalk": Oracle({"crosstalk_after[shoulder]": 0.06, "crosstalk_before[elbow]": -0.04}, read=leaking),
+    "torque_crosstalk": Oracle({"crosstalk_after[shoulder]": 0.06, "crosstalk_before[elbow]": -0.04}, read=crosstalk),
     "torque_drift": Oracle(
         each(*JOINTS, torque_drift=(0.05, -0.02, 0.03)),
         read=lambda v, t, torque: torque + np.outer(t - t.mean(), of_joints(v, "torque_drift")),
@@ -355,5 +355,5 @@ ORACLES = {
             )
         ),
     ),
-    "velocity_feedforward": Oracle(each(*ARM, velocity_feedforward=(0.03, -0.02)), sent=looking_ahead),
+    "velocity_feedforward": Oracle(each(*ARM, velocity_feedforward=(0.03, -0.02)), sent=feedforward),
 }

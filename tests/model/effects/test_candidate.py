@@ -51,7 +51,7 @@ def test_the_shape_of_a_key_does_not_depend_on_the_order_of_its_parameters():
 
 
 def test_keys_in_words():
-    """A shape is no part of the name."""
+    """The text does not contain the shape."""
     latch, drag = EffectKey("latch", "door_hinge", (("width", 0.1),)), EffectKey("drag", "door_hinge")
     assert str(latch) == "latch at door_hinge"
     assert names_of([latch, drag]) == "latch at door_hinge + drag at door_hinge"

@@ -1,4 +1,4 @@
-"""What every effect promises, whatever it is: nothing at neutral, something beyond, and no more than it declares."""
+"""The contract of all effects: no change at neutral, a change otherwise, and no more than they declare."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
 
 
 def having(part: str) -> list[str]:
-    """Names of the effects of the small scene that have shape parameters, or a friction loss."""
+    """Names of the effects of the small scene with shape parameters, or with a friction loss."""
     return [effect.name for effect in library(mechanism()) if getattr(effect, part)]
 
 
 @pytest.fixture(params=[n for n in EFFECTS if n != "contact_compliance"])
 def built_in(request: pytest.FixtureRequest, small: Bench) -> Effect:
-    """Each effect of the small scene, as its compiled replay has it."""
+    """Each effect of the small scene, as in its compiled replay."""
     return small.effect(request.param)
 
 
@@ -63,8 +63,8 @@ def test_the_name_is_the_registered_one(effect: Effect, request: pytest.FixtureR
     assert effect.name == request.node.callspec.params["effect"]
 
 
-def test_parameters_are_amplitudes_and_shapes(effect: Effect):
-    """Each is one of the two, coefficients of one place alone and zero at neutral."""
+def test_parameters_are_coefficients_and_shapes(effect: Effect):
+    """A coefficient belongs to one location and is zero at neutral."""
     named = [n for place in effect.locations.values() for n in place]
     assert named and all(effect.locations.values())
     assert sorted([*named, *effect.shape_parameters]) == sorted(p.name for p in effect.parameters)
@@ -84,22 +84,22 @@ def test_shapes_start_at_one_of_the_values_to_try(effect: Effect):
         assert not space[name].writes
 
 
-def test_words_are_there(effect: Effect):
+def test_descriptions_are_there(effect: Effect):
     for words in (effect.description, effect.signature):
         assert len(words.split()) >= 3 and words == words.strip() and not words.endswith(".")
 
 
-def test_what_it_may_be_confused_with_exists(effect: Effect):
+def test_effects_it_is_confused_with_exist(effect: Effect):
     assert effect.confused_with
     assert set(effect.confused_with) <= set(EFFECTS) - {effect.name}
     assert len(set(effect.confused_with)) == len(effect.confused_with)
 
 
-def test_what_it_holds_is_among_what_it_may_be_confused_with(effect: Effect):
+def test_special_cases_are_among_effects_it_is_confused_with(effect: Effect):
     assert set(effect.special_cases) <= set(effect.confused_with)
 
 
-def test_it_does_something(effect: Effect):
+def test_it_has_a_function_or_writes_the_model(effect: Effect):
     functions = (effect.profile, effect.command, effect.servo, effect.force, effect.frictionloss, effect.observe)
     assert any(functions) or all(p.writes for p in effect.parameters)
 
@@ -141,7 +141,7 @@ OF_BOTH = pytest.mark.parametrize("scene", ["mechanism", pytest.param("door", ma
 
 @OF_BOTH
 def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
-    """To the last digit, with the means in theta and with nothing there."""
+    """Exactly, with the means in theta and with an empty theta."""
     thetas = ({p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}, {})
     # In one program: some compile for seconds.
     forces = jax.jit(lambda state: [effect.force(theta, state) for theta in thetas]) if effect.force else None
@@ -167,7 +167,7 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
 
 
 @pytest.mark.parametrize("effect", having("shape_parameters"), indirect=True)
-def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
+def test_a_missing_shape_parameter_has_its_mean(effect: Effect, scene: Scene):
     loud = {p.name: jnp.float32(typical(p)) for p in coefficients(effect)}
     stated = loud | {name: jnp.float32(Space(effect.parameters)[name].mean) for name in effect.shape_parameters}
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
@@ -180,8 +180,8 @@ def test_a_shape_that_is_absent_is_at_its_mean(effect: Effect, scene: Scene):
 
 
 @pytest.mark.parametrize("effect", having("frictionloss"), indirect=True)
-def test_friction_never_pushes(effect: Effect, scene: Scene):
-    """At both bounds of every parameter the friction loss stays at or above zero, on more than one state."""
+def test_friction_loss_is_never_negative(effect: Effect, scene: Scene):
+    """At both bounds of each parameter, in several states."""
     assert effect.frictionloss
     base = jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
     for bound in ("low", "high"):
@@ -195,7 +195,7 @@ def test_friction_never_pushes(effect: Effect, scene: Scene):
 
 
 def numbers(model: Any, path: str = "") -> dict[str, np.ndarray]:
-    """Every array of an mjx.Model, parts included."""
+    """All arrays of an mjx.Model and its parts."""
     out = {}
     for field in dataclasses.fields(model):
         value = getattr(model, field.name)
@@ -245,7 +245,7 @@ def test_applying_twice_is_applying_once(effect: Effect, scene: Scene, apply):
     assert not differing(numbers(scene.mjx), before)
 
 
-def test_contacts_take_their_time_constant_from_all_of_a_grips_pairs():
+def test_contact_compliance_writes_all_pairs_of_a_grip():
     scene = door()
     (effect,) = library(scene, ["contact_compliance"])
     model = make_physics(scene, Space(effect.parameters), jnp.array([0.5])).model
@@ -265,7 +265,7 @@ def check_neutral(bench: Bench, base: Rollout) -> None:
 
 
 def check_coefficients(bench: Bench, effect: Effect) -> None:
-    """Each by itself, at a typical value and at its bounds, is seen and stays finite."""
+    """Each coefficient changes the replay at a typical value and at its bounds, which stays finite."""
     rows = [{}]
     for p in coefficients(effect):
         rows += [{p.name: value} for value in (typical(p), p.high, p.low) if value != p.mean]
@@ -276,7 +276,7 @@ def check_coefficients(bench: Bench, effect: Effect) -> None:
 
 
 def check_shapes(bench: Bench, effect: Effect) -> None:
-    """They do nothing by themselves, and every value of them is another effect beside a coefficient."""
+    """Shape parameters have no effect alone, and each of their values is another effect with a coefficient."""
     for name, values in effect.shape_parameters.items():
         shape = bench.space[name]
         tried = [{name: v} for v in sorted({*values, shape.low, shape.high})]
@@ -288,8 +288,8 @@ def check_shapes(bench: Bench, effect: Effect) -> None:
         assert (apart[~np.eye(len(tried), dtype=bool)] > SEEN).all(), apart
 
 
-def check_calm(bench: Bench, effect: Effect) -> None:
-    """No effect makes the torque jump up and down from one step to the next, or blow up."""
+def check_no_chatter(bench: Bench, effect: Effect) -> None:
+    """No effect makes the torque alternate from one step to the next, or diverge."""
     for torque in bench.torque(everywhere(effect), everywhere(effect, lambda p: p.high)):
         change = np.diff(torque, axis=0)
         turns = change[1:] * change[:-1] < 0
@@ -300,21 +300,21 @@ def test_neutral_is_the_scene_without_effects(small: Bench, small_bare: Rollout)
     check_neutral(small, small_bare)
 
 
-def test_every_amplitude_is_seen(small: Bench, built_in: Effect):
+def test_every_coefficient_changes_the_replay(small: Bench, built_in: Effect):
     check_coefficients(small, built_in)
 
 
-def test_shapes_matter_beside_a_coefficient(small: Bench, built_in: Effect):
+def test_shapes_act_with_a_coefficient(small: Bench, built_in: Effect):
     check_shapes(small, built_in)
 
 
 def test_nothing_chatters(small: Bench, built_in: Effect):
-    check_calm(small, built_in)
+    check_no_chatter(small, built_in)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in EFFECTS if n != "contact_compliance"])
-def test_neutral_alone_is_the_scene_without_effects(small: Bench, small_bare: Rollout, name: str):
+def test_each_effect_at_neutral_is_the_scene_without_effects(small: Bench, small_bare: Rollout, name: str):
     check_neutral(make_bench(small.scene, small.drive, [small.effect(name)]), small_bare)
 
 
@@ -337,12 +337,12 @@ def test_on_the_door(real: Bench, name: str):
     effect = bench.effect(name)
     check_coefficients(bench, effect)
     check_shapes(bench, effect)
-    check_calm(bench, effect)
+    check_no_chatter(bench, effect)
 
 
 @pytest.mark.slow
 def test_soft_contacts_are_contacts_of_another_time_constant(real: Bench):
-    """The one effect that the small scene cannot have, against a model compiled with it."""
+    """The only effect that the small scene cannot have, against a compiled model."""
     model = copy.copy(real.scene.model)
     model.pair_solref[:, 0] *= 1.5
     soft = bare(dataclasses.replace(real, scene=dataclasses.replace(real.scene, model=model)))
@@ -352,8 +352,8 @@ def test_soft_contacts_are_contacts_of_another_time_constant(real: Bench):
 
 
 @pytest.mark.slow
-def test_soft_gears_stay_calm_behind_a_stiff_servo():
-    """A servo of 4500 N m/rad against half a thousandth of a rad/(N m): a loop gain above two."""
+def test_soft_gears_do_not_chatter_with_a_stiff_servo():
+    """A servo of 4500 N m/rad with half a thousandth of a rad/(N m) has a loop gain above two."""
     bench = door_bench("paper", ["joint_backlash", "joint_compliance"])
     for effect in bench.effects:
-        check_calm(bench, effect)
+        check_no_chatter(bench, effect)

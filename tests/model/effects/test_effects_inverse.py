@@ -1,4 +1,4 @@
-"""Effects in the inverse mode: what a prescribed motion has to overcome, on the motor's side and on the link's."""
+"""Effects in inverse dynamics: torques that overcome them, on the motor side and on the link side."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 
 
 
 def prescribed(scene: Scene, side: TorqueSide, gravity: bool) -> Motion:
-    """Moments without order: every sign of angle and speed, some nearly at rest."""
+    """Random states with all signs of angle and speed, some nearly at rest."""
     rng = np.random.default_rng(6)
     size = (80, len(scene.joints))
     speed = rng.normal(0, 1.0, size)
@@ -59,7 +59,7 @@ def inverse_replay(scene: Scene, motion: Motion, effects: Sequence[Effect] = ())
 
 
 class Inverse:
-    """The inverse replay with all effects that it can have, and the sensor's own friction."""
+    """The inverse replay with all its possible effects, and the sensor's friction."""
 
     def __init__(self, scene: Scene, side: TorqueSide, gravity: bool) -> None:
         self.scene, self.side = scene, side
@@ -107,7 +107,7 @@ def inverse(request: pytest.FixtureRequest, scene: Scene) -> Inverse:
 
 
 def mj_inverse(spec: mujoco.MjSpec, motion: Motion, gravity: bool) -> np.ndarray:
-    """[T, J] N m that the links of an MJCF ask for."""
+    """[T, J] N m of the links of an MJCF."""
     for body in spec.bodies:
         body.gravcomp = 0
     for joint in spec.joints:
@@ -137,7 +137,7 @@ def test_forces_have_to_be_overcome(inverse: Inverse, name: str):
 @pytest.mark.parametrize("coulomb", [0.0, COULOMB])
 @pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.loss])
 def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float):
-    """On top of what is there: the MJCF's before the motor's sensor, the sensor's own behind the gear."""
+    """In addition to the MJCF's friction on the motor side, and to the sensor's on the link side."""
     oracle = ORACLES[name]
     seen = {f"coulomb[{j}]": coulomb for j in JOINTS}
     neutral, got = inverse.torque(seen, {**seen, **oracle.values})
@@ -155,7 +155,7 @@ def test_friction_has_to_be_overcome(inverse: Inverse, name: str, coulomb: float
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, o in ORACLES.items() if o.read])
-def test_sensors_read_what_they_read(inverse: Inverse, name: str):
+def test_sensor_effects_are_applied(inverse: Inverse, name: str):
     oracle = ORACLES[name]
     neutral, got = inverse.torque({}, dict(oracle.values))
     np.testing.assert_allclose(got, oracle.read(oracle.values, inverse.motion.time, neutral), atol=TOLERANCE)
@@ -176,8 +176,8 @@ def test_a_payload_is_carried(inverse: Inverse, name: str):
     assert np.abs(expected).max() > 100 * TOLERANCE
 
 
-def test_a_path_is_what_the_encoders_read(inverse: Inverse):
-    """The links ask for what they do where they are; a torque without weight lost that of the pose that is read."""
+def test_a_path_contains_encoder_readings(inverse: Inverse):
+    """Torques are those of the true pose; a torque without gravity had that of the read pose subtracted."""
     oracle = ORACLES["encoder_offset"]
     neutral, got = inverse.torque({}, dict(oracle.values))
     read, off = inverse.motion, np.array([oracle.values.get(f"encoder_offset[{j}]", 0.0) for j in JOINTS])
@@ -196,30 +196,30 @@ def test_a_path_is_what_the_encoders_read(inverse: Inverse):
     assert np.abs(expected).max() > 100 * TOLERANCE
 
 
-def test_firm_friction_is_nothing_to_overcome(inverse: Inverse):
+def test_firm_friction_has_no_effect(inverse: Inverse):
     neutral, got = inverse.torque({}, dict(ORACLES["soft_friction"].values))
     np.testing.assert_array_equal(got, neutral)
 
 
-def test_gains_of_servos_that_nobody_asks_change_nothing(inverse: Inverse):
+def test_servo_gains_have_no_effect(inverse: Inverse):
     neutral, got = inverse.torque({}, dict(ORACLES["servo_gain"].values))
     np.testing.assert_array_equal(got, neutral)
 
 
 def test_these_are_all_effects(scene: Scene):
-    """Whatever is added to the library has to find its place here."""
+    """A new effect must be added to one of these lists."""
     left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
     assert left == {"payload", "free_payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
     assert {e.name for e in library(scene)} == set(ORACLES)
 
 
 @pytest.mark.parametrize("name", STEERING)
-def test_what_steers_is_refused_by_name(scene: Scene, name: str):
+def test_effects_on_commands_are_refused_by_name(scene: Scene, name: str):
     given = prescribed(scene, MOTOR, True)
-    with pytest.raises(ValueError, match=rf"no commands that an effect could change: {name}$"):
+    with pytest.raises(ValueError, match=f"effects {name} change commands, which a prescribed motion"):
         inverse_replay(scene, given, library(scene, ["drag", name, "torque_bias"]))
 
 
-def test_all_that_steer_are_named(scene: Scene):
+def test_all_effects_on_commands_are_listed(scene: Scene):
     with pytest.raises(ValueError, match=", ".join(STEERING)):
         inverse_replay(scene, prescribed(scene, LINK, False), library(scene))

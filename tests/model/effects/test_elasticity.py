@@ -19,7 +19,7 @@ from droid_jax.model.scene import Scene, compile_scene
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.4])
-def test_inside_the_play_there_is_no_torque_and_an_elastic_gear_gives_in_proportion(scale: float):
+def test_backlash_has_no_torque_inside_and_compliance_is_linear(scale: float):
     scene = mechanism()
     space = Space(tuple(servo_scale(scene, joint, std=0.3) for joint in ARM))
     model = make_physics(scene, space, jnp.full(len(space), scale, jnp.float32)).model
@@ -43,8 +43,8 @@ def test_inside_the_play_there_is_no_torque_and_an_elastic_gear_gives_in_proport
     np.testing.assert_allclose(torque(soft), 0.002 / (1.0 / stiffness + 1e-3), rtol=1e-4)
 
 
-def test_what_is_recorded_of_an_elastic_gear_is_its_motor():
-    """The servo's own encoder sits there: a log of positions alone was compared with the links."""
+def test_the_recorded_position_of_an_elastic_joint_is_the_motors():
+    """The servo's encoder is on the motor."""
     scene = mechanism()
     (effect,) = library(scene, ["joint_compliance"])
     assert effect.observe is not None
@@ -62,8 +62,8 @@ def test_what_is_recorded_of_an_elastic_gear_is_its_motor():
     assert not np.any(seen.position[:, others]) and np.array_equal(seen.torque, torque)
 
 
-def test_an_elastic_gear_is_tried_at_a_size_that_shows_beside_its_servo():
-    """A percent of a servo's stiffness or more, a soft one's too: sizes were those of servos of 500 N m/rad."""
+def test_the_prior_of_compliance_is_relative_to_the_servo():
+    """A percent of a servo's compliance or more, also for a soft servo."""
     scene = mechanism()
     (effect,) = library(scene, ["joint_compliance"])
     for parameter, joint in zip(effect.parameters, ARM, strict=True):
@@ -99,7 +99,7 @@ def test_axes_and_rotation_are_mujocos(scene, body: str):
         np.testing.assert_allclose(rotation, data.xmat[made.id("body", body)].reshape(3, 3), atol=2e-6)
 
 
-def test_what_flies_has_none():
+def test_a_floating_body_has_none():
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body name='ball'><freejoint/><geom size='1'/>"
         "<body name='arm'><joint name='j'/><geom size='1'/></body></body></worldbody></mujoco>"

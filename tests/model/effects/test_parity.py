@@ -1,4 +1,4 @@
-"""Every effect against plain C MuJoCo: a feature of its own where it has one, else a formula before each mj_step."""
+"""Every effect against plain C MuJoCo: a feature of MuJoCo if there is one, else a formula before each mj_step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LATE = 0.05  # of an effect
 
 
 def in_c(drive: Drive, oracle: Oracle, *, late: float) -> np.ndarray:
-    """[T, J] N m by mj_step at the drive's time step, its commands `late` steps late."""
+    """[T, J] N m by mj_step at the drive's time step, with commands delayed by `late` steps."""
     v = oracle.values
     spec = mujoco.MjSpec.from_string(MECHANISM)
     spec.option.timestep = drive.timestep
@@ -75,7 +75,7 @@ def columns(oracle: Oracle) -> list[int]:
 
 
 def replayed(bench: Bench) -> dict[str, np.ndarray]:
-    """Every oracle's values through the replay, and neutral, in one batch."""
+    """The replay of all oracles' values, and of neutral, in one batch."""
     rows = {"": Oracle({}), **ORACLES}
     return dict(zip(rows, bench.torque(*(o.values for o in rows.values())), strict=True))
 
@@ -113,7 +113,7 @@ def test_the_effect_is_what_c_does(exact: Bench, torques: dict[str, np.ndarray],
 
 @pytest.mark.parametrize("name", ["hinge_preload", "joint_coulomb", "tilted_frame"])
 def test_the_formulas_agree_with_the_features(exact: Bench, name: str):
-    """Where MuJoCo has the effect itself, the formula that the other tests use must be the same."""
+    """If MuJoCo has the effect, the formula of the other tests must agree with it."""
     oracle = ORACLES[name]
     by_hand = Oracle(oracle.values, force=oracle.force, loss=oracle.loss)
     off = in_c(exact.drive, oracle, late=0.5) - in_c(exact.drive, by_hand, late=0.5)
@@ -122,7 +122,7 @@ def test_the_formulas_agree_with_the_features(exact: Bench, name: str):
 
 @pytest.mark.slow
 def test_at_the_usual_step_the_effects_are_near_the_continuous_ones(small: Bench):
-    """Against C at a fiftieth of the step."""
+    """Against C with a fiftieth of the step."""
     fine = mechanism_bench(small.drive.timestep / 50).drive
     got = replayed(small)
 

@@ -1,4 +1,4 @@
-"""A recording with an effect in it gives the effect's own parameters back."""
+"""A fit to a recording with an effect recovers the effect's parameters."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from droid_jax.model.parameters import Space
 
 NOISE = 0.003  # N m: a sensor's 0.01, the mean of ten repeats
 FAR = 5.0  # posterior deviations: 52 parameters stay inside unless something is wrong
-KNOWN = 0.15  # of a value: a posterior no wider says that the recording tells it
+KNOWN = 0.15  # relative width of a posterior up to which a parameter counts as identifiable
 LEFT_OVER = 1.05  # mean square of the residuals in units of the noise, which is 1 but for its own scatter of 0.01
 
 
 def starts(effect: Effect, free: Space) -> np.ndarray:
-    """[S, D] neutral, with every combination of shapes to try."""
+    """[S, D] neutral, with all combinations of shape values."""
     combinations = itertools.product(*effect.shape_parameters.values())
     return np.array([free.values(dict(zip(effect.shape_parameters, c, strict=True))) for c in combinations])
 
 
 def check_recovery(bench: Bench, name: str, truth: Mapping[str, float]) -> None:
-    """From neutral and the shapes to try, none of them the true one; every other effect stays at neutral."""
+    """From neutral and the library's shape values, none of which is true; all other effects stay at neutral."""
     free = bench.space.select(truth)
     columns = [bench.space.index(n) for n in truth]
     clean = bench.torque(truth)[0]
@@ -63,11 +63,11 @@ QUICK = ("command_delay", "torque_bias")
         if name != "soft_friction"  # which test_soft_friction.py has
     ],
 )
-def test_the_effects_parameters_come_back(small: Bench, name: str):
+def test_the_effects_parameters_are_recovered(small: Bench, name: str):
     check_recovery(small, name, ORACLES[name].values)
 
 
 @pytest.mark.slow
-def test_the_grips_softness_comes_back(real: Bench):
-    """The one effect that the small scene cannot have."""
+def test_the_grips_softness_is_recovered(real: Bench):
+    """The only effect that the small scene cannot have."""
     check_recovery(real, "contact_compliance", {"contact_softness": 0.7})

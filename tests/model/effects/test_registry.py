@@ -1,4 +1,4 @@
-"""The list of effects: what a scene can have, names, and effects of your own."""
+"""The registry: effects that a scene can have, names, and user effects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OF_GRIPS = {"contact_compliance"}
 
 @pytest.fixture
 def own_list(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever a test registers is gone after it."""
+    """Registrations of a test are removed after it."""
     registered()
     monkeypatch.setattr(registry, "_MAKERS", copy.copy(registry._MAKERS))
 
@@ -53,7 +53,7 @@ def edited(old: str, new: str, **options) -> Scene:
 
 
 def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
-    """A push at each of these joints, as a user would write it: theta is taken to hold every coefficient."""
+    """A force at each of these joints, as a user may write it: theta must contain all coefficients."""
 
     def force(theta, state):
         return sum((jnp.zeros_like(state.qvel).at[k].set(theta[f"grease[{j}]"]) for k, j in enumerate(joints)))
@@ -76,8 +76,8 @@ def grease_at(*joints: str, name: str = "grease", high: float = 9.0) -> Effect:
 
 
 @pytest.mark.slow
-def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
-    """An extended model has the parameters of what was named, and the effect reads all of its own."""
+def test_other_locations_of_an_extended_model_are_neutral():
+    """An extended model has the parameters of one location, and the effect reads those of all."""
     scene = mechanism()
     grease = grease_at(*JOINTS, high=2.0)
     drive = Drive(np.zeros((40, 3)), scene.initial_qpos({}), 0.005, MOTOR)
@@ -97,11 +97,11 @@ def test_a_model_that_names_one_place_leaves_the_others_at_neutral():
     ("effect", "said"),
     [
         (grease_at("door", name="thick grease", high=2.0), "'grease' makes is called 'thick grease'"),
-        (grease_at("door"), r"its shape 'thickness' lie outside its bounds \[0.1, 5\]: 9"),
+        (grease_at("door"), r"its shape parameter 'thickness' lie outside its bounds \[0.1, 5\]: 9"),
     ],
 )
 @pytest.mark.usefixtures("own_list")
-def test_an_effect_that_would_fail_later_is_refused(effect: Effect, said: str):
+def test_invalid_effects_are_refused(effect: Effect, said: str):
     @register
     def grease(scene):
         return effect
@@ -129,8 +129,8 @@ def test_a_door_alone_has_no_effects_of_arms():
     assert names(edited("", "", joints=["door"])) == set(registered()) - OF_GRIPS - OF_ARMS
 
 
-def test_motors_feel_no_soft_gears():
-    """Their torque is what is commanded, wherever they stand."""
+def test_motors_have_no_elasticity():
+    """Their torque is the command, whatever their position is."""
     motors = edited('"s" joint="shoulder" kp="80"', '"s" joint="shoulder" kp="0"')
     compliant = library(motors, sorted(OF_SERVOS))
     assert [list(e.locations) for e in compliant] == [["elbow"], ["elbow"]]
@@ -138,14 +138,14 @@ def test_motors_feel_no_soft_gears():
         assert [p.name for p in effect.parameters] == [f"{effect.name}[elbow]"]
 
 
-def test_joints_without_servos_have_none_of_theirs():
+def test_joints_without_servos_have_no_servo_effects():
     passive = edited('<position name="s" joint="shoulder" kp="80"/>', "")
     assert list(library(passive, ["servo_gain"])[0].locations) == ["elbow"]
     assert list(library(passive, ["joint_coulomb"])[0].locations) == list(ARM)
 
 
 def test_the_payload_hangs_on_the_end_of_the_chain():
-    """Though the channels name the elbow first, as the actuators do."""
+    """The order of the channels, which is that of the actuators, differs."""
     scene = edited("", "", joints=None)
     assert scene.joints == ("elbow", "door", "shoulder")
     (payload,) = library(scene, ["payload"])
@@ -156,7 +156,7 @@ def test_the_payload_hangs_on_the_end_of_the_chain():
 # ----- names
 
 
-def test_the_library_is_in_the_order_of_names_or_as_asked_for():
+def test_the_library_is_in_the_order_of_names_or_as_requested():
     scene = mechanism()
     assert [e.name for e in library(scene)] == sorted(names(scene))
     assert registered() == tuple(sorted(registered()))
@@ -177,8 +177,8 @@ def test_no_two_effects_share_a_parameter():
 # ----- sizes
 
 
-def test_sizes_are_those_of_another_machine():
-    """Torques grow, masses, gains and delays do not; neutral stays neutral."""
+def test_scaling_changes_torques_only():
+    """Masses, gains, delays and neutral values are unchanged."""
     usual, large = (effect_space(library(mechanism(), scale=k)) for k in (1.0, 30.0))
     assert usual.names == large.names
     torques = np.array([p.unit.startswith("N m") for p in usual.parameters])
@@ -193,7 +193,7 @@ def test_sizes_are_those_of_another_machine():
         assert after.minimum_size == pytest.approx((30.0 if grows else 1.0) * before.minimum_size)
 
 
-def test_slides_are_driven_by_forces():
+def test_units_at_slides_are_those_of_forces():
     scene = edited('"elbow" axis', '"elbow" type="slide" axis', joints=["elbow"], object_joint=None)
     names = ["cable_pull", "joint_coulomb", "torque_drift", "torque_gain", "torque_ripple"]
     space = effect_space(library(scene, [*names, "joint_stribeck", "joint_compliance", "joint_backlash"]))
@@ -232,16 +232,16 @@ def test_a_taken_name_is_refused(own_list: None):
     assert [e.name for e in library(mechanism(), ["drag"])] == ["drag"]
 
 
-def test_the_same_function_may_come_again(own_list: None):
-    """As when its file is run twice in one session."""
+def test_the_same_function_may_be_registered_again(own_list: None):
+    """Such as when its file is run twice in one session."""
     before = registered()
     register(registry._MAKERS["drag"])
     assert registered() == before
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Bench):
-    """A wind that opens the door: the opposite of a preload."""
+def test_a_user_effect_is_part_of_the_library(own_list: None, small: Bench):
+    """A wind that opens the door is the opposite of a preload."""
 
     @register
     def wind(scene: Scene) -> Effect | None:
@@ -265,12 +265,12 @@ def test_an_effect_of_ones_own_is_part_of_the_library(own_list: None, small: Ben
     assert np.abs(blown.torque({"wind": 0.8}) - blown.torque({})).max() > 0.5
 
 
-def test_it_is_gone_afterwards():
+def test_a_user_effect_is_removed_after_its_test():
     assert "wind" not in registered()
 
 
-def test_a_payload_is_kilograms_beside_a_fitted_mass():
-    """In MJX, in C, and in the MJCF; it was a share of the model's mass, times the fitted one."""
+def test_a_payload_adds_to_a_fitted_mass():
+    """In MJX, in C, and in the MJCF."""
     scene = edited(MECHANISM, MECHANISM.replace(' gravcomp="1"', ""))
     (payload,) = library(scene, ["payload"])
     space = Space((body_mass(scene, "hand", std=0.1, high=2.0),)) + effect_space([payload])
@@ -293,8 +293,8 @@ def test_a_ready_scene_has_a_friction_row_for_every_joint():
     assert made.joints == bare.joints and made.object_joint == "door"
 
 
-def test_friction_that_an_effect_brings_holds_where_the_scene_holds_friction(tmp_path: Path):
-    """Of joints and of the object, whose MJCF has none: it crept, since only friction of the MJCF was made hard."""
+def test_friction_of_effects_is_hard_if_the_scene_holds_friction(tmp_path: Path):
+    """At joints and at the object, whose MJCF has no friction."""
     path = tmp_path / "mechanism.xml"
     path.write_text(MECHANISM.replace(' frictionloss="0.2"', ""))
     given, held = (ready(load_scene(path, joints=ARM, object_joint="door", hold=h)) for h in (False, True))

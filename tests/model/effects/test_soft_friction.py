@@ -1,4 +1,4 @@
-"""Friction that holds a load: the simulated joint creeps as MuJoCo's constraint says, and stands where it is firm."""
+"""Soft and firm friction: the creep of MuJoCo's constraint, and its removal."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def creep(inertia: float, first: float, last: float) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inertia", [0.03, 0.002])
-def test_the_joint_creeps_by_the_share_that_is_left(inertia: float):
+def test_the_joint_creeps_by_the_remaining_share(inertia: float):
     bench, shares = held(inertia), (0.0, 0.5, 0.9, 1.0)
     position = bench.run(np.array([[share] for share in shares])).position[:, :, 0]
     half = position.shape[1] // 2
@@ -54,7 +54,7 @@ def test_the_joint_creeps_by_the_share_that_is_left(inertia: float):
 
 
 def in_c(first: float, seconds: float, frictionloss: float) -> tuple[np.ndarray, np.ndarray]:
-    """Clock [T] s at 2 ms and angle [T] rad of a joint that a servo swings and stops, in plain C at 0.05 ms."""
+    """Clock [T] s at 2 ms and angle [T] rad of a joint that a servo moves and stops, in plain C at 0.05 ms."""
     spec = mujoco.MjSpec.from_string(SERVO)
     spec.option.timestep = 5e-5
     spec.joint("j").solimp_friction[:2] = [first, max(first, 0.95)]
@@ -76,7 +76,7 @@ SERVO = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbod
 
 
 def swing(time):
-    """rad: there, a stop, back, a stop."""
+    """rad: a motion, a stop, back, a stop."""
     return 0.6 * np.clip(np.sin(1.5 * time) * 1.6, -1.0, 1.0)
 
 
@@ -87,7 +87,7 @@ def swinging() -> Bench:
 
 
 @pytest.mark.slow
-def test_firm_friction_is_what_c_has_at_the_same_impedance():
+def test_firm_friction_is_that_of_c_with_the_same_impedance():
     position = swinging().run(np.array([[0.0], [1.0]])).position[:, :, 0]
     soft, firm = (in_c(first, 4.0, 0.4)[1] for first in (0.9, 0.9999))
     np.testing.assert_allclose(position[0], soft, atol=2e-4)
@@ -103,7 +103,7 @@ def test_it_is_written_into_the_mjcf():
     np.testing.assert_allclose(joint.solimp_friction[:2], [0.9999, 0.9999])
 
 
-def test_its_places_are_joints_with_friction_that_is_not_firm_already():
+def test_locations_are_joints_with_soft_friction():
     plain = MJCF.replace("INERTIA", "0.03")
     none = scene_of(plain.replace('frictionloss="0.3"', ""))
     firm = scene_of(plain.replace('frictionloss="0.3"', 'frictionloss="0.3" solimpfriction="0.9999 0.9999"'))
@@ -114,8 +114,8 @@ def test_its_places_are_joints_with_friction_that_is_not_firm_already():
     assert has == [["j"]]
 
 
-def test_joints_that_creep_may_all_be_asked_about_together():
-    """Only those: the third is firm."""
+def test_all_joints_with_soft_friction_are_one_location():
+    """The third joint is firm, so it is not among them."""
     body = "<body><joint name='{}' frictionloss='0.3' {}/><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>{}</body>"
     inner = body.format("c", "solimpfriction='0.9999 0.9999'", "")
     chain = body.format("a", "", body.format("b", "", inner))
