@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.discrepancy.candidate_fits import Problem
 from droid_jax.discrepancy.candidates import directions_of
 from droid_jax.discrepancy.case import Case, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit
-from droid_jax.discrepancy.search import Problem, search_effects
+from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import sign_flips, t_values
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.identify.multistart import RefineConfig

@@ -63,8 +63,8 @@ def searched(
     board: folder for scalars of the base fit, and of the others that report iterations.
     keep: called with what there is and the seconds so far once the verdict is known, and after each amendment to it.
     """
-    from droid_jax.discrepancy.fitting import with_finer_step
     from droid_jax.discrepancy.missing import amended, search
+    from droid_jax.discrepancy.step_error import with_finer_step
     from droid_jax.report.progress import scalars, stages
 
     names = _stages(split, start is not None)

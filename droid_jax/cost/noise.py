@@ -30,7 +30,7 @@ class NoiseConfig:
     rate: Hz, of the coarse clock of what is smoothed; above twice the cutoff (Nyquist).
     longest_lag: s, beyond it an autocovariance counts as noise of its estimate: ten repeats estimate a hundred lags
       with nine degrees of freedom each, the weights then depend on the mean that they weigh, and p-values of nothing
-      are too small (tests/discrepancy/test_null_calibration.py).
+      are too small (tests/discrepancy/test_score_test.py).
     shrinkage: share by which an autocovariance is shrunk towards white noise of the same variance.
     least_window: share of the low pass's window that must be measured; the rest is renormalised, and its noise with it.
     trend_repeats: repeats from which on what grows or fades steadily from one to the next (a sensor that warms up) is

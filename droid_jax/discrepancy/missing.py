@@ -21,18 +21,11 @@ from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.discrepancy.case import Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import (
-    FinalModel,
-    FittedModel,
-    base_fit,
-    discretisation_error,
-    final_refit,
-    final_refit_due,
-    with_finer_step,
-)
-from droid_jax.discrepancy.log_case import base_model, case_of
+from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit, base_model, final_refit, final_refit_due
+from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.results import extended
-from droid_jax.discrepancy.search import search_effects, with_step_differences
+from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.step_error import discretisation_error, with_finer_step, with_step_differences
 from droid_jax.discrepancy.verdict import Experiment, Verdict
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE

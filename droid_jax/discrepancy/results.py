@@ -15,8 +15,9 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case, ResidualSet
-from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals, with_step_moves
+from droid_jax.discrepancy.fitting import FinalModel
 from droid_jax.discrepancy.maps import Localisation
+from droid_jax.discrepancy.posterior import fit_posterior, intervals, with_step_moves
 from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
 from droid_jax.files import GAP, GAP_TRACES, GAP_VERSION

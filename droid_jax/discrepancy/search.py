@@ -8,35 +8,28 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from droid_jax.cost.cost import Cost
-from droid_jax.cost.windowed_log import WindowedLog
-from droid_jax.discrepancy.candidates import (
-    Proposal,
-    ScoreDirection,
-    ScoreTest,
-    collinear,
-    directions_of,
-    proposals,
-    rows_of,
-    score_test,
+from droid_jax.discrepancy.candidate_fits import (
+    Notes,
+    Problem,
+    at_neutral,
+    converged_model,
+    polished,
+    proposals_after_one_step,
+    pruned,
+    search_refit,
+    staged_refit,
+    target_objective,
 )
-from droid_jax.discrepancy.case import Case, ResidualSet
-from droid_jax.discrepancy.config import CONVERGE_ITERATIONS
-from droid_jax.discrepancy.fitting import (
-    FittedModel,
-    at_values,
-    fitted_from_prior,
-    one_step_fits,
-    refit,
-    remaining_discrepancy,
-    remaining_residuals,
-    with_step_difference,
-)
+from droid_jax.discrepancy.candidates import Proposal, ScoreDirection, ScoreTest, collinear, directions_of, proposals
+from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.cross_validation import case_score_test, cross_validated
+from droid_jax.discrepancy.fitting import FittedModel, fitted_from_prior
+from droid_jax.discrepancy.posterior import remaining_discrepancy, remaining_residuals
 from droid_jax.discrepancy.selection import (
     WEAK,
     Reason,
@@ -44,58 +37,14 @@ from droid_jax.discrepancy.selection import (
     ValidationTest,
     much_more,
     selected,
-    significance_reasons,
     validation_tests,
     without_dominated,
 )
-from droid_jax.discrepancy.statistics import one_sided_p
-from droid_jax.discrepancy.verdict import Verdict, conclude, more_than_step_error, open_share
-from droid_jax.distributed import agreed
-from droid_jax.identify.multistart import RefineConfig
+from droid_jax.discrepancy.step_error import more_than_step_error
+from droid_jax.discrepancy.verdict import Verdict, conclude, open_share
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
-from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates, names_of
-
-TOGETHER = 4  # candidates whose first steps share batches: two starts of eight trials each fill two blocks of a CPU
-Starter = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What every step is given.
-
-    case: the recordings; base: the base model; base_discrepancy: its U on the validation recording;
-    discretisation_error: U0; directions: all that are tested; deadline: `time.monotonic` after which no further
-    candidate is tried; progress: called with a stage's name and value.
-    """
-
-    case: Case
-    base: FittedModel
-    base_discrepancy: float
-    discretisation_error: float
-    directions: tuple[ScoreDirection, ...]
-    deadline: float | None
-    progress: Progress
-
-    @property
-    def late(self) -> bool:
-        """No time left."""
-        return self.deadline is not None and agreed(time.monotonic() > self.deadline)
-
-    def discrepancy(self, model: FittedModel) -> float:
-        """U on the validation recording."""
-        return self.case.validation.discrepancy_at(model.values)
-
-
-@dataclass(frozen=True)
-class Notes:
-    """What went wrong by the way: models whose replay blew up, and what the budget left out."""
-
-    failed: tuple[str, ...] = ()
-    not_tried: tuple[str, ...] = ()
-
-    def __add__(self, other: Notes) -> Notes:
-        return Notes(self.failed + other.failed, self.not_tried + other.not_tried)
+from droid_jax.model.effects.candidate import EffectKey, candidates
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,32 +111,7 @@ def _explained(problem: Problem, model: FittedModel) -> bool:
     if not asked:
         return True
     problem.progress("score_test", model.name)
-    return _nothing_more(problem, model, tested(case, model, asked))
-
-
-def with_step_differences(case: Case, model: FittedModel, fine: Cost | None) -> Case:
-    """The case, its training recording and the blocks of both parts knowing what a quarter of the time step changes.
-
-    fine: what `with_finer_step` made of the training recording.
-    """
-    both = case.both
-    if both is not None:
-        same = fine
-        if isinstance(fine, WindowedLog) and isinstance(both.cost, WindowedLog):
-            same = replace(fine, whitener=both.cost.whitener, instants=both.cost.instants)
-        both = with_step_difference(both, model, same)
-    return replace(case, train=with_step_difference(case.train, model, fine), both=both)
-
-
-def tested(case: Case, model: FittedModel, asked: Sequence[ScoreDirection]) -> ScoreTest:
-    """The score test of the training recording; its p-value is that of all blocks, where validation has the others.
-
-    What is tried next goes by the training blocks alone, so that the validation blocks judge it.
-    """
-    found = score_test(case.train, model, asked, case.config.seed)
-    if case.both is None:
-        return found
-    return replace(found, p=score_test(case.both, at_values(case.both, model), asked, case.config.seed).p)
+    return _nothing_more(problem, model, case_score_test(case, model, asked))
 
 
 def _nothing_more(problem: Problem, model: FittedModel, found: ScoreTest) -> bool:
@@ -206,7 +130,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     if not asked:
         return replace(state, finished=True, exhausted=True), None
     problem.progress("score_test", model.name)
-    found = tested(case, model, asked)
+    found = case_score_test(case, model, asked)
     thresholds = case.config.selection
     exhausted = _nothing_more(problem, model, found)
     info, notes = SelectionStep(found), Notes()
@@ -244,7 +168,7 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     case, config = problem.case, problem.case.config
     ranked = proposals(found, model.residuals, case.full_space)
     begun = SelectionStep(found, model.keys, tuple(ranked))
-    promising, notes = _one_step_fits(problem, model, ranked[: config.one_step_fits], found)
+    promising, notes = proposals_after_one_step(problem, model, ranked[: config.one_step_fits], found)
     sure, others = promising[: config.sure_refits], promising[config.sure_refits :]
     others = sorted(others, key=lambda look: look[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda look: look[1])[: config.full_refits]
@@ -260,63 +184,6 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     what = "candidates collinear with the best not refitted"
     beside, more = staged_refit(problem, starters, aim, what, " (collinear with the best)")
     return _decided(problem, model, begun, [*tried, *beside]), notes + more
-
-
-def _one_step_fits(
-    problem: Problem, model: FittedModel, ranked: Sequence[Proposal], found: ScoreTest
-) -> tuple[list[tuple[np.ndarray, float, Proposal]], Notes]:
-    """Values [D] and objective of each proposal after one step (see `fitting.one_step_fits`), some at a time."""
-    out, config = list[tuple[np.ndarray, float, Proposal]](), problem.case.config
-    for first in range(0, len(ranked), TOGETHER):
-        if first and problem.late:
-            return out, _late(len(ranked) - first, len(ranked), "candidates not looked at")
-        asked, some = [], ranked[first : first + TOGETHER]
-        for proposal in some:
-            (part,), start = proposal.parts, proposal.start(problem.case.full_space, model.values)
-            problem.progress("one_step_fit", names_of((*model.keys, part.key)))
-            raw = {found.directions[k].coefficient: found.raw[k] for k in rows_of(found, proposal.parts)}
-            asked.append((part, raw, start))
-        ended = one_step_fits(problem.case.train, model, asked, config.one_step)
-        out += [(*end, proposal) for end, proposal in zip(ended, some, strict=True)]
-    return out, Notes()
-
-
-def _late(left: int, of: int, what: str) -> Notes:
-    return Notes(not_tried=(f"{left} of {of} {what}",))
-
-
-def _refit(
-    problem: Problem, parts: Sequence[Candidate], start: np.ndarray, config: RefineConfig, note: str = ""
-) -> FittedModel:
-    """Base parameters and parts from a start [D] over the whole space."""
-    problem.progress("refit", (names_of(p.key for p in parts) or "base") + note)
-    return refit(problem.case.train, problem.case.base, parts, start[None], config)
-
-
-def staged_refit(
-    problem: Problem, starters: Sequence[Starter], aim: float, what: str, note: str = ""
-) -> tuple[list[FittedModel], Notes]:
-    """Refits one after the other; one that will not reach the objective `aim`, or the best so far, is given up early.
-
-    what: says in words what is left out where time runs out.
-    """
-    models, failed = list[FittedModel](), list[str]()
-    for number, (parts, start) in enumerate(starters):
-        if number and problem.late:
-            return models, Notes(tuple(failed)) + _late(len(starters) - number, len(starters), what)
-        aim = min([aim, *(m.refined.objective for m in models)])
-        try:
-            models.append(_refit(problem, parts, start, replace(problem.case.config.refit, target_objective=aim), note))
-        except NotReplayed:
-            failed.append(names_of(p.key for p in parts))
-    return models, Notes(tuple(failed))
-
-
-def target_objective(problem: Problem, model: FittedModel) -> float:
-    """Objective [log likelihood] of a fit that would take half of what a further effect has to."""
-    config = problem.case.config.selection
-    least = 0.5 * (config.least_further_gain if model.parts else config.least_gain)
-    return model.refined.objective - 0.5 * least * model.discrepancy * problem.case.train.resampling.size
 
 
 def restart_from_prior(problem: Problem, done: SelectionStep) -> tuple[SelectionStep, Notes]:
@@ -360,7 +227,7 @@ def _beside(problem: Problem, done: SelectionStep, won: FittedModel) -> tuple[Se
     The base model is the one that does better on the validation recording, from there or unchanged.
     """
     case, config = problem.case, problem.case.config
-    basin = _neutral(problem, won, won.coefficients)
+    basin = at_neutral(problem, won, won.coefficients)
     tried = {m.keys for m in done.tried if m is not won}
     lost = [p for p in done.ranked if p.keys in tried]
     near = [*lost, *_collinear_candidates(done, config.selection.collinear)]
@@ -368,19 +235,11 @@ def _beside(problem: Problem, done: SelectionStep, won: FittedModel) -> tuple[Se
     note, what = " (from where the best one ended)", "alternatives not refitted where the best one ended"
     beside, notes = staged_refit(problem, starters, won.refined.objective, what, note)
     try:
-        before = min(problem.base, _refit(problem, (), basin, config.refit, note), key=problem.discrepancy)
+        before = min(problem.base, search_refit(problem, (), basin, config.refit, note), key=problem.discrepancy)
     except NotReplayed:
         before = problem.base
     best = {m.keys: m for m in sorted([*done.tried, *beside], key=lambda m: m.refined.objective, reverse=True)}
     return _decided(problem, before, done, list(best.values())), notes
-
-
-def _neutral(problem: Problem, model: FittedModel, coefficients: Sequence[str]) -> np.ndarray:
-    """[D] values of a model with some coefficients at neutral."""
-    space = problem.case.full_space
-    values, at = model.values.copy(), [space.index(a) for a in coefficients]
-    values[at] = space.mean[at]
-    return values
 
 
 def _collinear_candidates(done: SelectionStep, cosine: float) -> list[Proposal]:
@@ -440,56 +299,6 @@ def _pairs(problem: Problem, model: FittedModel, first: SelectionStep) -> tuple[
     return replace(done, selected=None, chosen=None), notes
 
 
-def pruned(problem: Problem, model: FittedModel) -> FittedModel:
-    """The model without effects that no longer take their share of U on the validation recording."""
-    config = problem.case.config
-    least = config.selection.least_share * problem.base_discrepancy
-    for part in model.parts if len(model.parts) > 1 else ():
-        start = _neutral(problem, model, part.coefficients)
-        try:
-            less = _refit(problem, without(part, model.parts), start, config.refit, f" without {part.key}")
-            needed = problem.discrepancy(less) - problem.discrepancy(model) >= least
-        except NotReplayed:  # it cannot do without the part
-            continue
-        if not needed:
-            return pruned(problem, less)
-    return model
-
-
-def without(part: Candidate, parts: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """The other parts; where one of them shares the part's shape parameters, it has them from now on."""
-    rest = [c for c in parts if c is not part]
-    heir = next((c for c in rest if c.effect == part.effect and part.shape_parameters and not c.shape_parameters), None)
-    return tuple(replace(c, shape_parameters=part.shape_parameters) if c is heir else c for c in rest)
-
-
-def converged_model(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
-    """The model fitted until it converges: what it has yet to take would be credited to the next effect."""
-    if model.refined.converged:
-        return model, Notes()
-    config = replace(problem.case.config.refit, iterations=CONVERGE_ITERATIONS)
-    return _continued(problem, model, config, " continued")
-
-
-def polished(problem: Problem, model: FittedModel) -> tuple[FittedModel, Notes]:
-    """The same model with slopes over the width of its posterior, whose intervals are reported, if that fit arrives."""
-    if not model.parts:
-        return model, Notes()
-    return _continued(problem, model, problem.case.config.polish, " polished")
-
-
-def _continued(problem: Problem, model: FittedModel, config: RefineConfig, note: str) -> tuple[FittedModel, Notes]:
-    """`model` fitted further; unchanged, with a note, where the result cannot be replayed on the validation motion, or
-    where `model` had converged and the further fit did not.
-    """
-    found = _refit(problem, model.parts, model.values, config, note)
-    if not np.isfinite(problem.case.validation.common(found.values)).all():
-        return model, Notes(failed=(model.name + note,))
-    if model.refined.converged and not found.refined.converged:
-        return model, Notes(not_tried=(f"{model.name}{note} to the end",))  # that its replay blew up would be false
-    return found, Notes()
-
-
 def _decided(
     problem: Problem, before: FittedModel, begun: SelectionStep, tried: Sequence[FittedModel]
 ) -> SelectionStep:
@@ -509,7 +318,7 @@ def _decided(
         seed=case.config.seed,
         natural_bounds=case.natural_bounds,
     )
-    tests = confirmed_in_turns(problem, before, tried, tests)
+    tests = cross_validated(problem, before, tried, tests)
     tests = without_small_gains(problem, before, tried, tests)
     tested = list(zip(tried, tests, strict=True))
     won = selected(tested, u0, problem.base_discrepancy, config)
@@ -518,46 +327,6 @@ def _decided(
     tests = without_dominated(tested, won, case.effects, u0, config)
     winner, chosen = won
     return replace(done, tests=tuple(tests), selected=winner, chosen=chosen)
-
-
-def confirmed_in_turns(
-    problem: Problem, before: FittedModel, tried: Sequence[FittedModel], tests: Sequence[ValidationTest]
-) -> list[ValidationTest]:
-    """The tests with both halves of a log for the best models that the validation blocks alone do not confirm.
-
-    Fitted to the validation blocks, a model is judged on the training blocks: twice as many blocks tell its gain from
-    chance (two-fold cross-validation).  Asked for where nothing else but its size is against a model.
-    """
-    out, case = list(tests), problem.case
-    if case.both is None:
-        return out
-    for k in np.argsort([t.discrepancy_validation for t in tests]).tolist()[: case.config.blocks.cross_validated]:
-        reasons = {r.reason for r in tests[k].reasons}
-        if Reason.NOT_CONFIRMED not in reasons or reasons - WEAK - {Reason.SMALL_GAIN} or problem.late:
-            continue
-        problem.progress("refit", f"{tried[k].name}, halves of the log in turns")
-        try:
-            p = _p_in_turns(case, before, tried[k])
-        except NotReplayed:
-            continue
-        kept = (r for r in tests[k].reasons if r.reason is not Reason.NOT_CONFIRMED)
-        out[k] = replace(tests[k], p=p, reasons=(*significance_reasons(p, case.config.selection), *kept))
-    return out
-
-
-def _p_in_turns(case: Case, before: FittedModel, model: FittedModel) -> float:
-    """p-value of a model's gain over the blocks of validation, fitted to training, and the other way round."""
-
-    def gains(judged: ResidualSet, without: FittedModel, extended: FittedModel) -> np.ndarray:
-        rows = judged.resampling
-        commons = judged.common(np.stack([without.values, extended.values]))
-        if not np.isfinite(commons).all():
-            raise NotReplayed(f"the simulation of {judged.comparison.name!r} blows up")
-        losses = [np.sum((rows.residuals(common) / rows.units) ** 2, axis=1) for common in commons]
-        return 0.5 * (losses[0] - losses[1])
-
-    other = [refit(case.validation, case.base, m.parts, m.values[None], case.config.refit) for m in (before, model)]
-    return one_sided_p(np.concatenate([gains(case.validation, before, model), gains(case.train, *other)]))
 
 
 def without_small_gains(
@@ -579,7 +348,7 @@ def without_small_gains(
             continue
         problem.progress("score_test", tried[k].name)
         if asked := open_directions(problem.directions, tried[k]):
-            found = tested(case, tried[k], asked)
+            found = case_score_test(case, tried[k], asked)
             if found.p < case.config.selection.significance:
                 break  # what explains less leaves more
         out[k] = replace(tests[k], reasons=tuple(r for r in tests[k].reasons if r.reason is not Reason.SMALL_GAIN))

@@ -13,7 +13,8 @@ import numpy as np
 from droid_jax.discrepancy.candidates import Proposal, ScoreTest
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, consistent_with_zero, intervals, remaining_discrepancy
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.posterior import consistent_with_zero, intervals, remaining_discrepancy
 from droid_jax.discrepancy.statistics import resample_weights
 from droid_jax.identify.fit import bound_of
 from droid_jax.model.effect_interface import Effect

@@ -11,9 +11,11 @@ import numpy as np
 from droid_jax.discrepancy.candidates import ScoreTest, Trend, trend
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, beyond_step_error, remaining_residuals
+from droid_jax.discrepancy.fitting import FittedModel
 from droid_jax.discrepancy.maps import Localisation, localise
+from droid_jax.discrepancy.posterior import remaining_residuals
 from droid_jax.discrepancy.selection import Reason, SelectionStep, ValidationTest, doubts
+from droid_jax.discrepancy.step_error import beyond_step_error, more_than_step_error
 from droid_jax.files import LOST
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import EffectKey, Keys, names_of
@@ -197,15 +199,6 @@ def _lost_narrowly(tests: Sequence[ValidationTest]) -> list[str]:
         ),
     )
     return [f"{' or '.join(names)}, {why}" for names, why in groups if names]
-
-
-def more_than_step_error(case: Case, model: FittedModel, found: ScoreTest, discretisation_error: float) -> bool:
-    """Whether what a score test found is more than the time step could leave, U0.
-
-    U of blocks holds their noise too: there it is what the best direction takes of it.
-    """
-    share = 1.0 if case.train.resampling.repeated else float(np.max(found.explained))
-    return beyond_step_error(share * model.discrepancy, discretisation_error)
 
 
 def conclude(

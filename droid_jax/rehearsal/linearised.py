@@ -19,8 +19,10 @@ from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
 from droid_jax.discrepancy.case import Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, model_at, until, with_finer_step, with_step_difference
-from droid_jax.discrepancy.log_case import base_model, case_of, least_residual, refitted_residual
+from droid_jax.discrepancy.fitting import FittedModel, base_model, model_at
+from droid_jax.discrepancy.log_case import case_of
+from droid_jax.discrepancy.log_noise import least_residual, refitted_residual
+from droid_jax.discrepancy.step_error import until, with_finer_step, with_step_difference
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import candidates

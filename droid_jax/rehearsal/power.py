@@ -14,8 +14,8 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
+from droid_jax.discrepancy.step_error import WORST
 from droid_jax.rehearsal.linear import Leftover, LinearModel, RehearsalConfig, leftover, unhindered
 
 LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for

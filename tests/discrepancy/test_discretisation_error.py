@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from small_gap import Small, small
 
-from droid_jax.discrepancy import fitting
+from droid_jax.discrepancy import step_error
 from droid_jax.discrepancy.candidates import directions_of, score_test
 from droid_jax.discrepancy.case import ResidualSet
-from droid_jax.discrepancy.fitting import (
+from droid_jax.discrepancy.posterior import fit_posterior, with_step_moves
+from droid_jax.discrepancy.step_error import (
     beyond_step_error,
     discretisation_error,
-    fit_posterior,
     with_finer_step,
     with_step_difference,
-    with_step_moves,
 )
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import candidates
@@ -64,7 +63,7 @@ def test_a_finer_simulation_that_blows_up_gives_no_error(found: Small):
 
 
 def test_the_finer_simulation_has_a_quarter_of_the_step(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(fitting, "make_cost", lambda scene, *_, **__: scene)
+    monkeypatch.setattr(step_error, "make_cost", lambda scene, *_, **__: scene)
     fine: Any = with_finer_step(found.case.train, found.base.space, found.recordings["train"])
     assert fine.model.opt.timestep == pytest.approx(found.scene.model.opt.timestep / 4)
 
@@ -128,7 +127,7 @@ def test_a_finer_step_is_compared_with_what_the_coarse_one_reached(found: Small)
                       mask=np.concatenate([c.mask[:, c.time <= end], c.mask[:, -1:]], axis=1))
         for name, c in recording.channels.items()
     }  # fmt: skip
-    kept = fitting.until(replace(recording, channels=late), cost.drives[0])
+    kept = step_error.until(replace(recording, channels=late), cost.drives[0])
     for name, channel in kept.channels.items():
         assert channel.time[-1] <= end + 1e-9 < late[name].time[-1]
         assert channel.values.shape[1] == channel.mask.shape[1] == len(channel.time) == len(late[name].time) - 1

@@ -13,12 +13,13 @@ import pytest
 from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.lone_log import LoneLog
-from droid_jax.discrepancy import log_case
+from droid_jax.discrepancy import log_noise
 from droid_jax.discrepancy.candidates import directions_of, score_test
 from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import at_values
-from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, refitted_residual, single_case
+from droid_jax.discrepancy.fitting import at_values, base_model
+from droid_jax.discrepancy.log_case import make_log, single_case
+from droid_jax.discrepancy.log_noise import noise_left, refitted_residual
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
@@ -129,8 +130,8 @@ def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.Mon
         asked.append(parts)
         return SimpleNamespace(residuals=np.tile(left - size * mark.ravel(), (3, 1)))
 
-    monkeypatch.setattr(log_case, "proposals", lambda *given: [other, best])
-    monkeypatch.setattr(log_case, "refit", refit)
+    monkeypatch.setattr(log_noise, "proposals", lambda *given: [other, best])
+    monkeypatch.setattr(log_noise, "refit", refit)
     case: Any = SimpleNamespace(train=None, base=None, full_space=None, config=DiscrepancyConfig())
     model: Any = SimpleNamespace(residuals=np.tile(left, (3, 1)), values=np.zeros(2))
     got = refitted_residual(case, model, found, columns)

@@ -12,15 +12,8 @@ from small_gap import FLOOR, Small, quiet, record, small
 
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.fitting import (
-    LONGEST_STEP,
-    FittedModel,
-    base_fit,
-    refit,
-    remaining_discrepancy,
-    remaining_residuals,
-    transfer_spread,
-)
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, refit
+from droid_jax.discrepancy.posterior import LONGEST_STEP, remaining_discrepancy, remaining_residuals, transfer_spread
 from droid_jax.discrepancy.statistics import Repeats
 from droid_jax.identify.identifiability import posterior_of
 

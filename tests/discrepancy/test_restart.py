@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from small_gap import PRELOAD, TRUTH, Small, problem_of, quiet, small
 
-from droid_jax.discrepancy import fitting, search
+from droid_jax.discrepancy import candidate_fits, fitting, search
+from droid_jax.discrepancy.candidate_fits import Notes, Problem
 from droid_jax.discrepancy.fitting import FittedModel, base_fit, fitted_from_prior
-from droid_jax.discrepancy.search import Notes, Problem, SearchState, restart_from_prior, selection_step
+from droid_jax.discrepancy.search import SearchState, restart_from_prior, selection_step
 from droid_jax.discrepancy.selection import SelectionStep
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import EffectKey, candidates
@@ -95,12 +96,12 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
     # A worse fit all the same: it is the other motion that counts.
     worse = replace(best.refined, objective=2 * found.base.refined.objective)
     there = replace(best, parts=(), space=found.base.space, refined=worse)
-    usual = search.refit
+    usual = candidate_fits.refit
 
     def refit(residual_set: Any, base: Any, parts: Any, *rest: Any) -> FittedModel:
         return usual(residual_set, base, parts, *rest) if parts else there
 
-    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(candidate_fits, "refit", refit)
     assert restart_from_prior(problem_of(found), lost)[0].selected is None
 
 

@@ -12,26 +12,22 @@ import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, small, small_scene
 
-from droid_jax.discrepancy import search
-from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
-from droid_jax.discrepancy.case import Case, make_case, restrained
-from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, base_fit
-from droid_jax.discrepancy.search import (
+from droid_jax.discrepancy import candidate_fits, cross_validation, search
+from droid_jax.discrepancy.candidate_fits import (
     Notes,
     Problem,
-    SearchState,
     converged_model,
-    open_directions,
-    pair_step,
     polished,
     pruned,
-    search_effects,
-    selection_step,
     staged_refit,
     target_objective,
     without,
 )
+from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
+from droid_jax.discrepancy.case import Case, make_case, restrained
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, base_fit
+from droid_jax.discrepancy.search import SearchState, open_directions, pair_step, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
 from droid_jax.discrepancy.verdict import Conclusion
@@ -94,7 +90,9 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
     asked = dict(left)
     monkeypatch.setattr(search, "open_directions", lambda *_: ("another",))
-    monkeypatch.setattr(search, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name)))
+    monkeypatch.setattr(
+        cross_validation, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name))
+    )
     base: Any = SimpleNamespace(parts=())
     extended: Any = SimpleNamespace(parts=("drag",))
     judged = search.without_small_gains(problem, base, models, tests)
@@ -128,8 +126,8 @@ def test_the_best_models_are_confirmed_with_the_halves_of_a_log_in_turns(
     case = SimpleNamespace(both=both, config=DiscrepancyConfig())
     problem: Any = SimpleNamespace(case=case, late=False, progress=quiet)
     found = {"b": 0.01, "c": 0.3}
-    monkeypatch.setattr(search, "_p_in_turns", lambda case, before, model: found[model.name])
-    judged = search.confirmed_in_turns(problem, SimpleNamespace(), models, tests)  # type: ignore[arg-type]
+    monkeypatch.setattr(cross_validation, "_cross_validated_p", lambda case, before, model: found[model.name])
+    judged = cross_validation.cross_validated(problem, SimpleNamespace(), models, tests)  # type: ignore[arg-type]
     assert [t.p for t in judged] == [found[m.name] if m.name in asked else 0.2 for m in models]
     confirmed = {
         m.name for m, t in zip(models, judged, strict=True) if Reason.NOT_CONFIRMED not in {r.reason for r in t.reasons}
@@ -198,7 +196,7 @@ def test_the_significance_is_configured(found: Small):
 
 
 def test_a_search_without_time_looks_at_one_group_of_candidates(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(search, "TOGETHER", 1)
+    monkeypatch.setattr(candidate_fits, "TOGETHER", 1)
     state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
     assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
@@ -219,7 +217,7 @@ def test_refits_stop_when_time_is_up_but_for_the_first(found: Small, monkeypatch
             raise NotReplayed("none of the starts could be replayed")
         return SimpleNamespace(keys=(parts[0].key,), refined=SimpleNamespace(objective=1.0))
 
-    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(candidate_fits, "refit", refit)
     starters = [((part,), found.base.values) for part in candidates(found.case.effects)]
     names = [str(part.key) for (part,), _ in starters]
     models, notes = staged_refit(problem_of(found), starters, 1e9, "candidates not refitted")
@@ -238,7 +236,7 @@ def test_a_refit_aims_at_the_best_so_far(found: Small, monkeypatch: pytest.Monke
         aims.append(config.target_objective)
         return SimpleNamespace(refined=SimpleNamespace(objective=next(objectives)))
 
-    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(candidate_fits, "refit", refit)
     starters = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
     staged_refit(problem_of(found), starters, 6.0, "candidates not refitted")
     assert aims == [6.0, 6.0, 3.0]
@@ -355,7 +353,7 @@ def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch
     def unmoved(train: Any, model: Any, asked: Any, config: Any) -> list[tuple[np.ndarray, float]]:
         return [(proposed, -np.inf) for *_, proposed in asked]
 
-    monkeypatch.setattr(search, "one_step_fits", unmoved)
+    monkeypatch.setattr(candidate_fits, "one_step_fits", unmoved)
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, (late_bomb(scene),)))
     assert verdict.score_tests[0].failed == () and verdict.score_tests[0].explained[0] > 0.5
@@ -382,15 +380,15 @@ def test_what_blows_up_on_the_validation_motion_while_it_is_fitted_further_stays
     refined = replace(found.base.refined, converged=False)
     model = replace(found.verdict.model, values=np.array([0.5]), refined=refined)
     whole, lost = (replace(model, values=np.array([x])) for x in (0.7, 1.5))
-    monkeypatch.setattr(search, "refit", lambda *arguments: whole)
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: whole)
     assert fitted_further(problem, model) == (whole, Notes())
-    monkeypatch.setattr(search, "refit", lambda *arguments: lost)
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: lost)
     kept, notes = fitted_further(problem, model)
     assert kept is model and len(notes.failed) == 1 and notes.failed[0].startswith(model.name)
 
 
 def test_what_has_converged_is_fitted_no_further(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(search, "refit", lambda *arguments: pytest.fail("it has converged"))
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: pytest.fail("it has converged"))
     assert converged_model(problem_of(found), found.verdict.model) == (found.verdict.model, Notes())
     assert polished(problem_of(found), found.base) == (found.base, Notes())  # no intervals to report
 
@@ -465,7 +463,7 @@ def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatc
         assert starts[0].tolist() == [2.0, 0.0]  # the drag at neutral
         return SimpleNamespace(parts=parts, keys=(damper.key,), values=starts[0], left=1.01)
 
-    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(candidate_fits, "refit", refit)
     monkeypatch.setattr(Problem, "discrepancy", lambda problem, model: model.left)
     whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
     case: Any = SimpleNamespace(full_space=whole, config=found.case.config, train=None, base=None)
@@ -508,7 +506,7 @@ def test_a_further_fit_that_does_not_arrive_leaves_the_converged_model(monkeypat
         (True, model(False, 2.0), False, Notes(not_tried=("a polished to the end",))),
         (True, model(True, np.nan), False, Notes(failed=("a polished",))),
     ):
-        monkeypatch.setattr(search, "_refit", lambda *_, after=after: after)
+        monkeypatch.setattr(candidate_fits, "search_refit", lambda *_, after=after: after)
         begun = model(before)
-        found, said = search.polished(problem, begun)
+        found, said = candidate_fits.polished(problem, begun)
         assert found is (after if taken else begun) and said == notes

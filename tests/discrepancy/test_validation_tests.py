@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, small
 
-from droid_jax.discrepancy import fitting, selection
+from droid_jax.discrepancy import posterior, selection
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, consistent_with_zero, deviations, intervals, refit
+from droid_jax.discrepancy.fitting import FittedModel, refit
+from droid_jax.discrepancy.posterior import consistent_with_zero, deviations, intervals
 from droid_jax.discrepancy.selection import Reason, ValidationTest, much_more, validation_tests, zero_warning
 from droid_jax.discrepancy.statistics import Repeats, detrended
 from droid_jax.identify.identifiability import posterior_of
@@ -109,7 +110,7 @@ def test_coefficients_that_may_all_be_zero_have_intervals_that_say_so(found: Sma
     cov = true.cov.copy()
     cov[at], cov[:, at] = 0.0, 0.0
     cov[at, at] = 1.0
-    monkeypatch.setattr(fitting, "posterior_of", lambda *args: replace(true, cov=cov))
+    monkeypatch.setattr(posterior, "posterior_of", lambda *args: replace(true, cov=cov))
     space, values = found.case.full_space, model.values.copy()
     for name, off, zero in ((part.coefficients, 1.8, False), (part.coefficients[:1], 1.8, True)):
         values[[space.index(a) for a in part.coefficients]] = 0.0
@@ -132,7 +133,7 @@ def test_of_two_coefficients_that_trade_each_may_be_zero_and_not_both(
     at = [model.space.index(a) for a in part.coefficients]
     cov = np.eye(len(model.space))
     cov[np.ix_(at, at)] = [[1.0, -0.99], [-0.99, 1.0]]
-    monkeypatch.setattr(fitting, "posterior_of", lambda *args: SimpleNamespace(cov=cov))
+    monkeypatch.setattr(posterior, "posterior_of", lambda *args: SimpleNamespace(cov=cov))
     space, values = found.case.full_space, model.values.copy()
     for name, sign in zip(part.coefficients, signs, strict=True):
         values[space.index(name)] = space[name].mean + sign * space[name].std

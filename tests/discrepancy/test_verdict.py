@@ -11,11 +11,13 @@ import pytest
 from small_gap import FLOOR, Small, problem_of, small
 
 from droid_jax.discrepancy import search
+from droid_jax.discrepancy.candidate_fits import Notes
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, remaining_discrepancy
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.posterior import remaining_discrepancy
 from droid_jax.discrepancy.results import gap_json
-from droid_jax.discrepancy.search import Notes, SearchState, search_effects, selection_step
+from droid_jax.discrepancy.search import SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
 from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worsened
