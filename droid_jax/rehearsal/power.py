@@ -278,7 +278,7 @@ def _of_blocks(
 ) -> ScoreDraws:
     count, held = rows.units, model.prior * model.slack
     flips = _some_flips(count, config)
-    left = rows.left_after_flips(unit, model.tested.base, held, flips)  # [F, K]
+    left = rows.flipped_sizes(unit, model.tested.base, held, flips)  # [F, K]
     inside = [np.flatnonzero(rows.block == b) for b in range(count)]
     drawn = model.tested.noise(config.draws, rng)
 
