@@ -1,4 +1,4 @@
-"""Tests with both halves of a log: the blocks that train and those that validate."""
+"""Tests that use both halves of a log: the training blocks and the validation blocks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from droid_jax.identify.search import NotReplayed
 
 
 def case_score_test(case: Case, model: FittedModel, asked: Sequence[ScoreDirection]) -> ScoreTest:
-    """The score test of the training recording; its p-value is that of all blocks, where validation has the others.
+    """The score test of a case: on the training recording, for a log with the p-value of all blocks.
 
-    What is tried next goes by the training blocks alone, so that the validation blocks judge it.
+    Candidates are ranked on the training blocks alone, since the validation blocks judge them afterwards.
     """
     found = score_test(case.train, model, asked, case.config.seed)
     if case.both is None:
@@ -30,10 +30,11 @@ def case_score_test(case: Case, model: FittedModel, asked: Sequence[ScoreDirecti
 def cross_validated(
     problem: Problem, before: FittedModel, tried: Sequence[FittedModel], tests: Sequence[ValidationTest]
 ) -> list[ValidationTest]:
-    """The tests with both halves of a log for the best models that the validation blocks alone do not confirm.
+    """The validation tests, with two-fold cross-validation of the best models that validation blocks do not confirm.
 
-    Fitted to the validation blocks, a model is judged on the training blocks: twice as many blocks tell its gain from
-    chance (two-fold cross-validation).  Asked for where nothing else but its size is against a model.
+    The model is also fitted to the validation blocks and judged on the training blocks.  Its gain is then tested with
+    twice as many blocks.  Models are cross-validated only if there is no other reason against them than significance
+    and size.
     """
     out, case = list(tests), problem.case
     if case.both is None:
@@ -42,18 +43,18 @@ def cross_validated(
         reasons = {r.reason for r in tests[k].reasons}
         if Reason.NOT_CONFIRMED not in reasons or reasons - WEAK - {Reason.SMALL_GAIN} or problem.late:
             continue
-        problem.progress("refit", f"{tried[k].name}, halves of the log in turns")
+        problem.progress("refit", f"{tried[k].name}, cross-validation")
         try:
             p = _cross_validated_p(case, before, tried[k])
         except NotReplayed:
             continue
-        kept = (r for r in tests[k].reasons if r.reason is not Reason.NOT_CONFIRMED)
-        out[k] = replace(tests[k], p=p, reasons=(*significance_reasons(p, case.config.selection), *kept))
+        others = (r for r in tests[k].reasons if r.reason is not Reason.NOT_CONFIRMED)
+        out[k] = replace(tests[k], p=p, reasons=(*significance_reasons(p, case.config.selection), *others))
     return out
 
 
 def _cross_validated_p(case: Case, before: FittedModel, model: FittedModel) -> float:
-    """p-value of a model's gain over the blocks of validation, fitted to training, and the other way round."""
+    """p-value of a model's gain on the validation blocks and, fitted to these, on the training blocks."""
 
     def gains(judged: ResidualSet, without: FittedModel, extended: FittedModel) -> np.ndarray:
         rows = judged.resampling

@@ -1,7 +1,7 @@
 """Base parameters and effects fitted together by full replays.
 
-Residual regression alone is biased by the servo loop, contact and stiction: what a candidate adds is measured only
-after everything else has been allowed to move.
+Linear regression of residuals is biased by the servo loop, contact and stiction.  The gain of a candidate is therefore
+measured after a refit of all parameters.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from droid_jax.model.parameters import Space
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A fitted model: the base parameters and the effects that are in it.
+    """A fitted model: base parameters and effects.
 
-    parts: the effects, none for the base model.
-    values: [D] over the whole space, absent effects at neutral.
-    space: what was free.
-    refined: how the fit ended, over `space`.
-    residuals: [N, M] of the fitted recording's repeats, or blocks.
-    discrepancy: their U.
+    parts: its effects, none for the base model.
+    values: [D] over the full space, absent effects at neutral.
+    space: the free parameters.
+    refined: result of the fit, over `space`.
+    residuals: [N, M] of the fitted recording's repeats or blocks.
+    discrepancy: U of these residuals.
     """
 
     parts: tuple[Candidate, ...]
@@ -46,12 +46,12 @@ class FittedModel:
 
     @property
     def keys(self) -> Keys:
-        """Of the effects."""
+        """Keys of the effects."""
         return keys_of(self.parts)
 
     @property
     def name(self) -> str:
-        """ "base", "latch at door_hinge", "latch at door_hinge + drag at door_hinge": for people."""
+        """Name for messages: "base", "latch at door_hinge", "latch at door_hinge + drag at door_hinge"."""
         return names_of(self.keys) or "base"
 
     @property
@@ -75,7 +75,7 @@ def refit(
         residual_set: of the recording.
         base: the base parameters.
         parts: the effects.
-        starts: [S, D] over the whole space; what is not free stays as in the first one.
+        starts: [S, D] over the full space; fixed parameters keep their values in the first one.
         config: of the refinement.
         hypotheses: see `identify.multistart.refine`.
         progress: called with each iteration.
@@ -90,9 +90,16 @@ def refit(
     begin = starts[:, whole.columns(space)]
     refined = refine(residuals, space, begin, config, hypotheses=hypotheses, progress=progress)
     values = whole.embed(space, refined.best[None], starts[0])[0]
+    return _fitted_model(residual_set, parts, values, space, refined)
+
+
+def _fitted_model(
+    residual_set: ResidualSet, parts: Sequence[Candidate], values: np.ndarray, space: Space, refined: Refined
+) -> FittedModel:
+    """The model of a fit to one recording, with its residuals and their U."""
     rows = residual_set.resampling
-    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
-    return FittedModel(tuple(parts), values, space, refined, left, rows.discrepancy(left))
+    residuals = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
+    return FittedModel(tuple(parts), values, space, refined, residuals, rows.discrepancy(residuals))
 
 
 def one_step_fits(
@@ -101,18 +108,20 @@ def one_step_fits(
     asked: Sequence[tuple[Candidate, Mapping[str, np.ndarray], np.ndarray]],
     config: LevenbergMarquardtConfig | None = None,
 ) -> list[tuple[np.ndarray, float]]:
-    """A model with one more effect after one step, with slopes that are known already: values [D] and objective of each
-    effect, all in the same batches.
+    """Models with one more effect each, after one Levenberg-Marquardt step with known slopes, all in the same batches.
 
-    A step begins at the proposed values and without the effect, and the better end counts: it takes parameters two
-    prior deviations at most, and a strong effect is many.
+    Each effect has two starts: its proposed coefficients, and neutral.  A step moves a parameter by at most two prior
+    deviations, and the coefficient of a strong effect may be larger.  The better end of the two is returned.
 
     Args:
         residual_set: of the fitted recording.
         model: without the effects.
-        asked: effects; of each what a unit of a coefficient adds to the simulation at `model`, [M] in one repeat's
-            noise, and values [D]: the model with the effect's coefficients at their linear best.
+        asked: of each effect its candidate, coefficient -> sensitivity [M] at `model` in one repeat's noise, and values
+            [D] of the model with the proposed coefficients.
         config: of the steps.
+
+    Returns:
+        Values [D] and objective of each effect's model.
     """
     whole = residual_set.cost.space
     looks = list[Look]()
@@ -126,17 +135,22 @@ def one_step_fits(
         without[coefficients] = model.values[coefficients]
         starts = np.stack([without, proposed])[:, whole.columns(space)]
         looks.append(Look(space, starts, jacobian, functools.partial(whole.embed, space, values=without)))
-    ended = chords(residual_set.whitened, looks, config)
-    return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ended, strict=True)]
+    ends = chords(residual_set.whitened, looks, config)
+    return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ends, strict=True)]
 
 
 def base_fit(
     train: ResidualSet, base: Space, config: DiscrepancyConfig, progress: Progress, start: np.ndarray | None = None
 ) -> FittedModel:
-    """Everything but the effects, fitted to the training recording.
+    """The base model, fitted to the training recording.
 
-    start: [F] values of the base parameters out of an earlier fit; without it they are searched for.  That fit has
-      looked for other basins, and this one does not again, neither by hops nor by hypotheses of the grip.
+    Args:
+        train: residual set of the training recording.
+        base: the base parameters.
+        config: settings of the search.
+        progress: called with a stage's name and its progress.
+        start: [F] values of the base parameters from an earlier fit; None: CMA-ES searches from the prior.  The earlier
+            fit has tried other basins, so this one makes no basin hops and tries no hypotheses of the grip.
     """
     if start is None:
         return fitted_from_prior(train, base, (), config, progress)
@@ -148,48 +162,49 @@ def base_fit(
 def base_model(
     case: Case, start: np.ndarray | None = None, progress: Callable[[RefineProgress], None] | None = None
 ) -> FittedModel:
-    """The base parameters of a case in blocks fitted, from where the case says unless a start [D] is given.
+    """The base model of a case in blocks, fitted from `start` [D], from the case's start or from the prior's mean.
 
-    Inverse dynamics is smooth in them, and windows nearly are, so one start and no search will do.
+    The residuals of inverse dynamics, and nearly those of windows, are smooth in the parameters.  One start suffices.
     """
-    known = case.full_space.mean if case.start is None else case.start
-    start = known if start is None else start
+    default = case.full_space.mean if case.start is None else case.start
+    start = default if start is None else start
     return refit(case.train, case.base, (), start[None], case.config.refine, progress=progress)
 
 
 def fitted_from_prior(
     train: ResidualSet, base: Space, parts: Sequence[Candidate], config: DiscrepancyConfig, progress: Progress
 ) -> FittedModel:
-    """Base parameters and the effects `parts`, searched for from the prior on and refined like the base fit.
+    """Base parameters and the effects `parts`, fitted from the prior by CMA-ES and a refinement like the base fit.
 
-    What is missing bends the base fit, and may leave it in another basin than the truth's: a door whose catch the model
-    lacks was fitted by fingers that slip.  A refit continues from there, and the right effect then explains the fitted
-    motion and not the other one.  From the prior on, with the effect in the model from the first replay, it explains
-    both.
+    A missing effect biases the base fit and may move it into a wrong basin.  (A door whose catch the model lacks was
+    fitted by slipping fingers.)  A refit that continues from there may explain the fitted motion and no other one.  A
+    fit from the prior, with the effect in the model from the first replay, explains both.
 
-    The search moves coefficients and holds shape parameters at the candidates' values; the refinement frees both.
-    Raises NotReplayed where the replay of every start blows up.
+    CMA-ES moves coefficients and keeps shape parameters at the candidates' values.  The refinement frees both.
+
+    Raises:
+        NotReplayed: the replay of every start blows up.
     """
     whole = train.cost.space
     at = whole.values({name: value for part in parts for name, value in part.shape_parameters.items()})
     coefficients = [a for part in parts for a in part.coefficients]
     main = whole.select([*(p.name for p in base.parameters if not p.nuisance), *coefficients])
-    found = cma_search(
+    searched = cma_search(
         search_cost(lambda rows: np.mean(train.distances(rows), axis=1), train.comparison.penalty, whole, main, at),
         main,
         config.search,
         progress=lambda p: progress("search", p),
     )
     space = whole.select([*base.names, *coefficients])
-    begin, hypotheses = whole.embed(space, starts(space, main, found), at), grip_hypotheses(base)
+    begin, hypotheses = whole.embed(space, starts(space, main, searched), at), grip_hypotheses(base)
     return refit(train, base, parts, begin, config.refine, hypotheses, lambda p: progress("refine", p))
 
 
 @dataclass(frozen=True, eq=False)
 class FinalModel:
-    """The model that a search hands on, and what it is fitted to.
+    """The model that a search returns, and the residual sets that it is fitted to.
 
-    not_made: why it is the search's own although a fit to both motions was due, empty where none was or it was made.
+    not_made: reason why a final refit that was due is missing; empty if it was made or was not due.
     """
 
     model: FittedModel
@@ -198,7 +213,7 @@ class FinalModel:
 
 
 def final_refit_due(train: ResidualSet, model: FittedModel) -> bool:
-    """Whether a model is to be fitted to both motions once it is selected."""
+    """Whether the selected model gets a final refit to both motions."""
     return bool(model.parts) and (train.resampling.repeated or isinstance(train.cost, WindowedLog))
 
 
@@ -209,18 +224,17 @@ def final_refit(
     config: RefineConfig,
     progress: Progress = lambda stage, value: None,
 ) -> FinalModel:
-    """The selected model, fitted further to both motions with the care of a base fit.
+    """The selected model, refined further on both motions with the settings of a base fit.
 
-    Effects are selected on a motion that the fit did not see.  What is then simulated and trained with is better not of
-    one motion alone: of a door whose catch has another form than the library's, the first motion by itself was fitted
-    best by pads that had changed places (torsional friction 2.5 and 1.2, where the truth is 0.79 and 2.29), both
-    together by 0.88 and 2.31.  Verdict, sizes and discrepancies stay those of the search; the test motion stays out of
-    every fit.
+    Effects are selected on the validation motion, which the search does not fit.  The returned model should not depend
+    on one motion alone.  (The catch of a door had another form than the library's.  A fit to the first motion exchanged
+    the two pads: torsional friction 2.5 and 1.2, truth 0.79 and 2.29.  A fit to both found 0.88 and 2.31.)  Verdict,
+    sizes and discrepancies stay those of the search.  No fit uses the test motion.
 
-    Of commanded logs with few repeats these are the blocks that trained and those that validated.
+    For commanded logs with few repeats the two sets are the training blocks and the validation blocks.
 
-    Without an effect the model stays unchanged, since `identify` fits a base model to any number of recordings.  So
-    does that of a log without commands, and one whose fit to both does not converge.
+    The model is returned unchanged if it has no effect (`identify` fits base models to several recordings), for a log
+    without commands, and if the final refit does not converge.
     """
     if not final_refit_due(train, model):
         return FinalModel(model, (train,))
@@ -228,7 +242,7 @@ def final_refit(
 
     def residuals(rows: np.ndarray) -> np.ndarray:
         values = whole.embed(space, rows, model.values)
-        # The validation recording's own nuisances are at their best: they are no part of the model.
+        # The per-recording nuisances of the validation recording are fitted to it: they are no part of the model.
         return np.concatenate([-e.common(values) * e.repeats**0.5 for e in (train, validation)], axis=1)
 
     begin = model.values[whole.columns(space)]
@@ -237,21 +251,33 @@ def final_refit(
     if not refined.converged:
         return FinalModel(model, (train,), "the fit to both motions did not converge")
     values = whole.embed(space, refined.best[None], model.values)[0]
-    left = train.residuals(values)
-    refitted = FittedModel(model.parts, values, space, refined, left, train.resampling.discrepancy(left))
+    residuals_train = train.residuals(values)
+    discrepancy = train.resampling.discrepancy(residuals_train)
+    refitted = FittedModel(model.parts, values, space, refined, residuals_train, discrepancy)
     return FinalModel(refitted, (train, validation))
 
 
 def model_at(
     residual_set: ResidualSet, space: Space, values: np.ndarray, parts: Sequence[Candidate] = (), spreads: int = 1
 ) -> tuple[FittedModel, np.ndarray]:
-    """A model at known values [D], with the slopes that a fit has; and [M, F] slopes along each axis of its space.
+    """A model at known values, without a fit, and its slopes along each axis of its space.
 
-    A fit's slopes are of steps along its posterior's axes (`wide_jacobian`), in which several parameters move together
-    by so much that sticking joints let go.  There the slope of a delay was no longer the delay's own: what a parameter
-    may absorb of an effect shows in the steps along one axis.
+    The model's Jacobian is that of a fit: slopes along the principal axes of the posterior (`wide_jacobian`).  These
+    steps move several parameters by so much that sticking joints break away.  The slope of a single parameter, which
+    may absorb an effect, is better taken from a step along its axis alone.
 
-    spreads: see `LevenbergMarquardtConfig.spreads`.
+    Args:
+        residual_set: of the recording.
+        space: the free parameters.
+        values: [D] over the full space.
+        parts: effects of the model.
+        spreads: see `LevenbergMarquardtConfig.spreads`.
+
+    Returns:
+        The model, and [M, F] slopes along each axis.
+
+    Raises:
+        NotReplayed: the replay blows up.
     """
     whole, config = residual_set.cost.space, RefineConfig(iterations=0, basin_hops=0, spreads=spreads)
 
@@ -268,18 +294,19 @@ def model_at(
         space, x, space.from_search(x), float(state.objective[0]), state.residual[0],
         problem.wide_jacobian(state, slopes[0]), problem.prior, state.objective, problem.evaluations, 0, True,
     )  # fmt: skip
-    rows = residual_set.resampling
-    left = rows.residuals(-refined.residual / np.sqrt(residual_set.repeats))
     at = whole.embed(space, refined.best[None], values)[0]
-    return FittedModel(tuple(parts), at, space, refined, left, rows.discrepancy(left)), slopes[0]
+    return _fitted_model(residual_set, parts, at, space, refined), slopes[0]
 
 
 def at_values(residual_set: ResidualSet, model: FittedModel) -> FittedModel:
-    """A model that was fitted elsewhere, with its slopes in another residual set and what the base leaves there."""
+    """A fitted model on another residual set: its slopes there, and its residuals projected on the base columns.
+
+    The base parameters were not fitted to all of these instants.  Their error is in the residuals, alike in every row,
+    so sign flips cannot distinguish it from an effect.  The projection removes it.
+    """
     here, _ = model_at(residual_set, model.space, model.values, model.parts, RefineConfig().spreads)
     root, free = np.sqrt(residual_set.repeats), here.refined.free
-    # What other instants than the fitted ones ask of the base is in the residuals, and no flip knows it: taken out.
-    held = here.refined.prior[free] * root * residual_set.prior_slack
-    common = project(here.residuals.mean(axis=0)[None], here.refined.jacobian[:, free] / root, held)[0]
-    left = residual_set.resampling.residuals(common)
-    return replace(here, residuals=left, discrepancy=residual_set.resampling.discrepancy(left))
+    prior = here.refined.prior[free] * root * residual_set.prior_slack
+    common = project(here.residuals.mean(axis=0)[None], here.refined.jacobian[:, free] / root, prior)[0]
+    residuals = residual_set.resampling.residuals(common)
+    return replace(here, residuals=residuals, discrepancy=residual_set.resampling.discrepancy(residuals))

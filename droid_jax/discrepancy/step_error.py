@@ -1,4 +1,4 @@
-"""What the simulation's own time step changes: replays at a finer step, and U0, the U that it leaves."""
+"""The error of the simulation's time step: replays at a finer step, and U0, its part of U."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.replay import Drive
 
-FINER = 4  # parts of a time step
-# The step's whole U over U0, of an error that falls no faster than the step: what `beyond_step_error` allows for.
-WORST = (FINER / (FINER - 1)) ** 2
+FINER = 4  # finer steps in a time step
+# Largest ratio of the time step's U to U0: that of an error of first order in the step (see `beyond_step_error`).
+FIRST_ORDER_RATIO = (FINER / (FINER - 1)) ** 2
 
 
 def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
-    """The cost of the base model at a quarter of the time step; None where the time step is no error: without commands,
-    which has none, and of data that were made with this very step (`CompareConfig.mj_step`).
+    """The cost of the base model at a quarter of the time step.
+
+    None if there is no discretisation error: inverse dynamics of a recording without commands takes no steps, and
+    `CompareConfig.mj_step` states that the data were simulated with this very step.
     """
     cost = residual_set.cost
     if not isinstance(cost.drives[0], Drive) or residual_set.comparison.config.mj_step:
@@ -38,29 +40,29 @@ def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording
 
 
 def until(recording: Recording, drive: Drive) -> Recording:
-    """What was measured before a replay ends: one of finer steps may go on for a part of a step."""
-    end = float(recording.time[0]) + float(drive.time[-1]) + 1e-9  # as `observation.prepared` has it
+    """The recording up to the end of a replay.  A replay with finer steps may last for a part of a step longer."""
+    end = float(recording.time[0]) + float(drive.time[-1]) + 1e-9  # as in `observation.prepared`
     channels = {
-        name: replace(c, time=c.time[seen], values=c.values[:, seen], mask=c.mask[:, seen])
+        name: replace(c, time=c.time[inside], values=c.values[:, inside], mask=c.mask[:, inside])
         for name, c in recording.channels.items()
-        for seen in (c.time <= end,)
+        for inside in (c.time <= end,)
     }
     return replace(recording, channels=channels)
 
 
 @functools.lru_cache(maxsize=4)
 def _finer(scene: Scene) -> Scene:
-    """The same scene each time, so that its program is compiled once."""
+    """The scene with a finer step.  Cached, so that its program is compiled once."""
     return with_options(scene, timestep=float(scene.model.opt.timestep) / FINER)
 
 
 def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> ResidualSet:
-    """The same residual set, knowing what a quarter of the time step changes.
+    """The residual set with `step_difference`, the change of its residuals at a quarter of the time step.
 
     Args:
         residual_set: of the recording that the model was fitted to.
         model: the base model.
-        fine: what `with_finer_step` made of the same recording; None leaves the set unchanged.
+        fine: cost of the same recording from `with_finer_step`; None returns the set unchanged.
 
     Raises:
         NotReplayed: the finer replay blows up.
@@ -77,49 +79,52 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
 
 
 def with_step_differences(case: Case, model: FittedModel, fine: Cost | None) -> Case:
-    """The case, its training recording and the blocks of both parts knowing what a quarter of the time step changes.
+    """The case with the step difference (`with_step_difference`) of its training set and of `Case.both`.
 
-    fine: what `with_finer_step` made of the training recording.
+    fine: cost of the training recording from `with_finer_step`.
     """
     both = case.both
     if both is not None:
-        same = fine
+        fine_both = fine
         if isinstance(fine, WindowedLog) and isinstance(both.cost, WindowedLog):
-            same = replace(fine, whitener=both.cost.whitener, instants=both.cost.instants)
-        both = with_step_difference(both, model, same)
+            fine_both = replace(fine, whitener=both.cost.whitener, instants=both.cost.instants)
+        both = with_step_difference(both, model, fine_both)
     return replace(case, train=with_step_difference(case.train, model, fine), both=both)
 
 
 def discretisation_error(residual_set: ResidualSet, model: FittedModel) -> float:
-    """U0, the U that the simulation's own time step leaves; zero where no finer step was measured.
+    """U0, the part of U that comes from the time step.
 
-    The base model is replayed at a quarter of the time step and taken for data.  What the base parameters cannot absorb
-    of the difference would be called a discrepancy though nothing is missing.
+    A replay at a quarter of the time step takes the place of the data.  The difference that the base parameters cannot
+    absorb would count as a discrepancy although nothing is missing.
 
     Args:
-        residual_set: of the recording that the model was fitted to (`with_step_difference`).
+        residual_set: of the recording that the model was fitted to, see `with_step_difference`.
         model: the base model.
+
+    Returns:
+        U0 in squared noise units; zero if there is no step difference.
     """
     if residual_set.step_difference is None:
         return 0.0
-    off, count = residual_set.step_difference, residual_set.repeats
-    left = project(off[None], model.refined.jacobian / np.sqrt(count), model.refined.prior * np.sqrt(count))[0]
-    return float(left @ left / residual_set.resampling.counted.sum())
+    difference, root = residual_set.step_difference, np.sqrt(residual_set.repeats)
+    projected = project(difference[None], model.refined.jacobian / root, model.refined.prior * root)[0]
+    return float(projected @ projected / residual_set.resampling.counted.sum())
 
 
 def beyond_step_error(discrepancy: float, discretisation_error: float) -> bool:
-    """Whether U is more than the time step could leave.
+    """Whether U is larger than the time step can make it.
 
-    U0 is what a quarter of the step changes.  Of an error of second order that is nearly all of it; where joints stick,
-    or where a motion begins with a jolt, the error falls with the step itself, and a quarter of it stays.
+    U0 comes from the difference to a quarter of the step.  For an error of second order this is nearly the whole error.
+    Where joints stick, or where a motion begins with a jolt, the error is of first order and a quarter of it remains.
     """
-    return discrepancy > WORST * discretisation_error
+    return discrepancy > FIRST_ORDER_RATIO * discretisation_error
 
 
 def more_than_step_error(case: Case, model: FittedModel, found: ScoreTest, discretisation_error: float) -> bool:
-    """Whether what a score test found is more than the time step could leave, U0.
+    """Whether a significant score test shows more than the error of the time step (`beyond_step_error`).
 
-    U of blocks holds their noise too: there it is what the best direction takes of it.
+    U of blocks includes the noise.  There the part of U that the best direction explains is compared instead.
     """
     share = 1.0 if case.train.resampling.repeated else float(np.max(found.explained))
     return beyond_step_error(share * model.discrepancy, discretisation_error)

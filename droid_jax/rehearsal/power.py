@@ -15,7 +15,7 @@ import scipy.stats
 
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
-from droid_jax.discrepancy.step_error import WORST
+from droid_jax.discrepancy.step_error import FIRST_ORDER_RATIO
 from droid_jax.rehearsal.linear import Leftover, LinearModel, RehearsalConfig, leftover, unhindered
 
 LEAST, MOST = 0.2, 80.0  # noncentralities between which the smallest size is looked for
@@ -116,7 +116,7 @@ def discrepancy_crossings(model: LinearModel, k: int, of: Leftover, config: Rehe
         return np.zeros(config.draws)
     rng, step_error, out = np.random.default_rng([config.seed, 3, k]), model.step_error, np.zeros(config.draws)
     parts: tuple[tuple[Literal["train", "validation"], float, float], ...] = (
-        ("train", WORST, model.repeats),
+        ("train", FIRST_ORDER_RATIO, model.repeats),
         ("validation", 1.0, model.judging_repeats),
     )
     for part, factor, count in parts:

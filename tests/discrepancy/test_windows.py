@@ -23,7 +23,7 @@ from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
-from droid_jax.discrepancy.candidates import SMALL, observable_effects
+from droid_jax.discrepancy.candidates import SENSITIVITY_STEP, observable_effects
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
@@ -252,7 +252,7 @@ def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
     The size is that of the score test, at which slow commands must be limited.
     """
     effects = library(scene(), ["profile_speed"])
-    whole, theta = joined(space, effects), {"profile_speed[swing]": SMALL * effects[0].parameters[0].std}
+    whole, theta = joined(space, effects), {"profile_speed[swing]": SENSITIVITY_STEP * effects[0].parameters[0].std}
     assert effects[0].profile is not None and theta["profile_speed[swing]"] == pytest.approx(1.5)
     log = log_of(whole, [swung("a", 1.0, 0.7)], effects=effects)
     windows, command = log.pieces[0].windows, log.drives[0].command
