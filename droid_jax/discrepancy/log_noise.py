@@ -1,4 +1,4 @@
-"""The noise of one log, estimated from what the base model and the best candidates leave of it."""
+"""The noise of a log, estimated from the residuals of the base model and of the best candidates."""
 
 from __future__ import annotations
 
@@ -29,9 +29,11 @@ Report: TypeAlias = Callable[[RefineProgress], None] | None
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """Noise of one log.
+    """The noise of one log.
 
-    deviation: [C] to state.  block: s, length of the blocks.  values: [D] of the base fitted meanwhile.
+    deviation: [C] standard deviation of each column, in its unit.
+    block: s, length of the blocks.
+    values: [D] of the base model, which is fitted for the estimate.
     """
 
     deviation: np.ndarray
@@ -48,68 +50,87 @@ def noise_of(
     start: np.ndarray | None,
     progress: Report = None,
 ) -> NoiseEstimate:
-    """What to state as the noise of a log, and how long its blocks are, from what lies before `end`.
+    """The noise of a log and the length of its blocks, from its instants before `end`.
 
-    One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual that
-    an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, in columns where
-    that is less than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base
-    leaves.  Of a commanded log a candidate that takes much of a column is fitted in full too: in a replay a strong
-    effect is not linear.
-    The fifth is there because the best of many candidates takes noise too, and what it leaves is correlated for too
-    short a time.  It is asked of each column: a clock at another rate shows in positions, and a torque sensor's noise
-    stays whatever explains them.
-    So with something missing that the library explains in part only, noise is stated too large and blocks are long:
-    intervals are wide and less is named.  A discrepancy in these units is no absolute size, but ratios of
-    discrepancies are free of the unit.
+    One recording does not separate noise from discrepancy.  The estimate is the residual of the base model with up to
+    `max_effects` candidates, which are selected and fitted linearly.  It is used in columns where it is less than
+    `BlocksConfig.noise_share` of the base model's squared residual.  In other columns the base model's residual is
+    used: the best of many candidates fits noise too, and its residual is correlated for too short a time.  Columns are
+    compared one by one, since a wrong clock rate shows in positions while a torque sensor's noise remains.
+
+    Replays are not linear in a strong effect.  For a commanded log a candidate that explains much of a column is
+    therefore refitted in full.
+
+    If the library explains a missing effect only in part, the noise is overestimated and blocks are long.  Intervals
+    are then wide, and fewer effects are named.  Discrepancies of a log have no absolute size in these noise units, but
+    their ratios do not depend on the unit.
+
+    Args:
+        log: the cost of the log.
+        base: the base parameters.
+        effects: candidates.
+        end: s on the log's clock.
+        config: settings of the search.
+        start: [D] where the base fit begins; None: it is fitted first from the prior's mean.
+        progress: called with each iteration.
     """
     inside = log.clock < end
     block = fewest_blocks(log.clock[inside], log.clock[0])
     block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
-    if start is None:  # what the prior's mean leaves is no noise
+    if start is None:  # the residual at the prior's mean is no estimate of the noise
         start = _rough_fit(log, base, effects, log.space.mean, block, config, progress)[1].values
     case, model, deviation = _rough_fit(log, base, effects, start, block, config, progress)
     found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
     common = model.residuals.mean(axis=0)
 
     def by_column(residual: np.ndarray) -> np.ndarray:
-        """[K, C] in physical units of [M] in units of the stated deviation, of what is inside."""
+        """[K, C] residual before `end`, in physical units, of one in units of the stated deviation [M]."""
         return (residual.reshape(len(deviation), -1).T * deviation)[inside]
 
-    whole, rest = by_column(common), by_column(least_residual(found, common, log.space, config))
-    # Inverse dynamics is nearly linear in what an effect adds; a replay is not.
+    of_base, least = by_column(common), by_column(least_residual(found, common, log.space, config))
+    # Inverse dynamics is nearly linear in the coefficients of an effect; a replay is not.
     refitted = None
     if isinstance(log, WindowedLog):
         refitted = refitted_residual(case, model, found, len(deviation), progress)
     if refitted is not None:
         other = by_column(refitted)
-        rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
-    left = noise_left(whole, rest, config.blocks.noise_share)
+        least = np.where(np.sum(other**2, axis=0) < np.sum(least**2, axis=0), other, least)
+    noise = noise_residual(of_base, least, config.blocks.noise_share)
     rate = config.compare.noise.rate
-    stated = stated_deviation(left, log.moves[inside], rate)
-    # Each window begins at its own measured state, so that what they leave of slow noise is short.
-    lasting = rest if isinstance(log, WindowedLog) else left
-    return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
+    stated = stated_deviation(noise, log.moves[inside], rate)
+    # Each window begins at its own measured state, which shortens the correlation of slow noise.
+    correlated = least if isinstance(log, WindowedLog) else noise
+    return NoiseEstimate(stated, block_length(correlated, config.blocks, rate), model.values)
 
 
 def refitted_residual(
     case: Case, model: FittedModel, found: ScoreTest, columns: int, progress: Report = None
 ) -> np.ndarray | None:
-    """[M] what the candidate that takes most of any one column leaves once it is fitted in full; None where none takes
-    `BlocksConfig.refit_share` of a column.
+    """[M] residual after a full refit of the candidate that explains most of a single column.
 
-    Of many columns an effect at one joint explains few, and so a small share of all.
+    Columns are compared one by one, since an effect at one joint explains few of them and a small share of all.
+
+    Args:
+        case: a case whose training set is the log.
+        model: the base model.
+        found: its score test.
+        columns: number of columns C.
+        progress: called with each iteration.
+
+    Returns:
+        None if no candidate explains `BlocksConfig.refit_share` of a column, or if the replay blows up.
     """
     space, common = case.full_space, model.residuals.mean(axis=0)
-    whole = np.sum(common.reshape(columns, -1) ** 2, axis=1)
+    squares = np.sum(common.reshape(columns, -1) ** 2, axis=1)
 
-    def share(proposal: Proposal) -> float:
-        """Of the column in which it leaves least."""
+    def smallest_share(proposal: Proposal) -> float:
+        """Smallest share of a column's squared residual that remains with the proposal."""
         rows = rows_of(found, proposal.parts)
         sizes = [proposal.sizes[found.directions[k].coefficient] for k in rows]
-        left = common - sizes @ found.sensitivities[rows]
-        return float(np.min(np.sum(left.reshape(columns, -1) ** 2, axis=1) / np.maximum(whole, 1e-30)))
+        remaining = common - sizes @ found.sensitivities[rows]
+        return float(np.min(np.sum(remaining.reshape(columns, -1) ** 2, axis=1) / np.maximum(squares, 1e-30)))
 
-    ranked = [(share(proposal), k, proposal) for k, proposal in enumerate(proposals(found, common[None], space))]
+    ranked = [(smallest_share(p), k, p) for k, p in enumerate(proposals(found, common[None], space))]
     least, _, best = min(ranked)
     if least > 1 - case.config.blocks.refit_share:
         return None
@@ -121,11 +142,15 @@ def refitted_residual(
     return fitted.residuals.mean(axis=0)
 
 
-def noise_left(whole: np.ndarray, least: np.ndarray, share: float) -> np.ndarray:
-    """[K, C] what counts as noise of each column: what the best candidates leave, where that is less than a share of
-    the base model's residual `whole` [K, C], in squares.
+def noise_residual(base: np.ndarray, least: np.ndarray, share: float) -> np.ndarray:
+    """[K, C] residual that counts as noise in each column.
+
+    Args:
+        base: [K, C] residual of the base model.
+        least: [K, C] residual of the best candidates.
+        share: of the base model's squared residual below which the column of `least` is taken.
     """
-    return np.where(np.sum(least**2, axis=0) < share * np.sum(whole**2, axis=0), least, whole)
+    return np.where(np.sum(least**2, axis=0) < share * np.sum(base**2, axis=0), least, base)
 
 
 def _rough_fit(
@@ -137,32 +162,46 @@ def _rough_fit(
     config: DiscrepancyConfig,
     progress: Report,
 ) -> tuple[Case, FittedModel, np.ndarray]:
-    """The base fitted with the noise [C] stated that `values` [D] leave."""
+    """The case, the fitted base model and its stated noise [C], which is that of the residuals at `values` [D]."""
     noise, inside = config.compare.noise, block >= 0
-    left = stated_deviation(log.residual(values)[inside], log.moves[inside], noise.rate)
-    deviation = np.maximum(left, log.least_noise())
+    stated = stated_deviation(log.residual(values)[inside], log.moves[inside], noise.rate)
+    deviation = np.maximum(stated, log.least_noise())
     rows = with_blocks(log, deviation, block, config)
     case = Case(rows, rows, None, base, tuple(effects), config)
     return case, base_model(case, values, progress), deviation
 
 
-def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
-    """[M] what the best `max_effects` candidates leave of residuals `left` [M], one after the other, linearly.
+def least_residual(found: ScoreTest, residual: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
+    """[M] residual after the best `max_effects` candidates, one after the other, by linear regression.
 
-    One that takes less than an effect must is left out: it would take noise.
+    A candidate that explains less than `SelectionConfig.least_gain` ends the selection, since it would fit noise.
+
+    Args:
+        found: score test of the base model.
+        residual: [M] common residual of the base model.
+        space: of all parameters.
+        config: settings of the search.
     """
     for _ in range(config.max_effects):
-        best = proposals(found, left[None], space)[0]
+        best = proposals(found, residual[None], space)[0]
         if best.explained < config.selection.least_gain:
             break
-        taken, _ = np.linalg.qr(found.sensitivities[rows_of(found, best.parts)].T)
-        left = left - taken @ (taken.T @ left)
-        found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
-    return left
+        basis, _ = np.linalg.qr(found.sensitivities[rows_of(found, best.parts)].T)
+        residual = residual - basis @ (basis.T @ residual)
+        found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ basis) @ basis.T)
+    return residual
 
 
 def with_blocks(
     log: Log, deviation: np.ndarray, block: np.ndarray, config: DiscrepancyConfig, least: int = FEWEST_REPEATS
 ) -> ResidualSet:
-    """Its instants in blocks [K], with noise of a deviation [C]; least: blocks that there must be."""
+    """The residual set of a log in blocks.
+
+    Args:
+        log: the cost of the log.
+        deviation: [C] noise of each column, in its unit.
+        block: [K] block number of each instant.
+        config: settings of the search.
+        least: least number of blocks.
+    """
     return block_residual_set(log.with_noise(deviation, block >= 0), block, config, least)

@@ -168,7 +168,7 @@ def validation_tests(
         spans = {a: s for a, s in intervals(train, model).items() if a not in before.coefficients}
         if before.parts:
             beyond = functools.partial(remaining_discrepancy, train, validation, model)
-            enough = much_more(left[0], left[k + 1], beside, beyond, base_discrepancy, config)
+            enough = reduced_enough(left[0], left[k + 1], beside, beyond, base_discrepancy, config)
         else:
             enough = left[k + 1] <= (1 - config.least_gain) * left[0]
         reasons = [
@@ -218,7 +218,7 @@ def indistinguishable(
     return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
 
 
-def much_more(
+def reduced_enough(
     before: float,
     after: float,
     beside: Callable[[], float],

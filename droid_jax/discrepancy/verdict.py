@@ -79,7 +79,7 @@ class Verdict:
     before, after: where U lives on the training recording.
     config: the thresholds.
     remainder: U on the validation recording that neither `model` nor the uncertainty of its fit explains
-        (`fitting.remaining_residuals`), None where no fit converged.
+        (`posterior.remaining_residuals`), None where no fit converged.
     score_tests, validation_tests: the grounds, in the order they were made.
     failed: models whose replay blew up where their refit was to begin, or on the test recording, which then is not in
         `discrepancies`.

@@ -19,7 +19,7 @@ from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_cas
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import at_values, base_model
 from droid_jax.discrepancy.log_case import make_log, single_case
-from droid_jax.discrepancy.log_noise import noise_left, refitted_residual
+from droid_jax.discrepancy.log_noise import noise_residual, refitted_residual
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
@@ -102,9 +102,9 @@ def test_noise_is_what_candidates_leave_in_the_columns_that_they_explain():
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(200, 2)) * [1.0, 0.1]
     whole = noise + np.sin(np.linspace(0.0, 9.0, 200))[:, None] * [0.0, 1.0]
-    left = noise_left(whole, noise, 0.2)
+    left = noise_residual(whole, noise, 0.2)
     assert np.array_equal(left, noise)
-    assert np.array_equal(noise_left(whole, 0.5 * whole, 0.2), whole)
+    assert np.array_equal(noise_residual(whole, 0.5 * whole, 0.2), whole)
 
 
 @pytest.mark.parametrize(("size", "fitted"), [(1.0, True), (0.3, False)])  # of the effect; noise is 1

@@ -129,7 +129,7 @@ def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
     won = replace(lost, selected=lost.tried[0])
     assert restart_from_prior(problem_of(found), won) == (won, Notes())
     done, notes = restart_from_prior(problem_of(found, deadline=0.0), lost)
-    assert done is lost and notes == Notes(not_tried=("the fit from the prior on",))
+    assert done is lost and notes == Notes(not_tried=("the fit from the prior",))
     empty = replace(lost, tried=())
     for left in (found.base.discrepancy, -0.005):  # U is below zero in half of the cases where nothing is missing
         problem = replace(problem_of(found), base=replace(found.base, discrepancy=left))

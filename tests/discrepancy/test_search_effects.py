@@ -196,10 +196,10 @@ def test_the_significance_is_configured(found: Small):
 
 
 def test_a_search_without_time_looks_at_one_group_of_candidates(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(candidate_fits, "TOGETHER", 1)
+    monkeypatch.setattr(candidate_fits, "ONE_STEP_BATCH", 1)
     state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
-    assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
+    assert state.notes.not_tried[0] == "2 of 3 candidates without a one-step fit" and state.notes.failed == ()
 
 
 def test_a_search_without_time_refits_one_candidate_and_says_what_it_left_out(found: Small):

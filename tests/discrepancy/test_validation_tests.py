@@ -14,7 +14,7 @@ from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.discrepancy.fitting import FittedModel, refit
 from droid_jax.discrepancy.posterior import consistent_with_zero, deviations, intervals
-from droid_jax.discrepancy.selection import Reason, ValidationTest, much_more, validation_tests, zero_warning
+from droid_jax.discrepancy.selection import Reason, ValidationTest, reduced_enough, validation_tests, zero_warning
 from droid_jax.discrepancy.statistics import Repeats, detrended
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.search import NotReplayed
@@ -213,7 +213,7 @@ def test_a_further_effect_takes_its_share(after: float, beside: float | None, be
     def asked(value: float | None) -> float:
         return pytest.fail("was not to be asked") if value is None else value
 
-    assert much_more(1.0, after, lambda: asked(beside), lambda: asked(beyond), 2.0, SelectionConfig()) is enough
+    assert reduced_enough(1.0, after, lambda: asked(beside), lambda: asked(beyond), 2.0, SelectionConfig()) is enough
 
 
 @pytest.mark.slow
