@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import check_channels
-from droid_jax.cost.cost import Cost, check_friction_rows, check_read, followed
+from droid_jax.cost.cost import check_friction_rows, check_read, followed
 from droid_jax.cost.log_piece import STRETCH, TRACES, Piece, as_a_whole, in_windows, replayed, shared_steps
 from droid_jax.cost.noise import Noise
 from droid_jax.cost.observation import Measured, ShortFilter, least_noise
@@ -60,9 +60,11 @@ class Whitener:
 
 
 @dataclass(frozen=True, eq=False)
-class WindowedLog(Cost):
-    """The cost of pooled logs.
+class WindowedLog:
+    """The cost of pooled logs: called like a `Cost`, without what a `Cost` can do with other repeats or comparisons.
 
+    scene, space: what is simulated, and the meaning of the vectors [D].  comparisons: one, of all logs.  drives: one
+    for each recording.
     pieces: repeats of recordings.  order: [K] their instants one after the other, as the log has them.
     unit: [K] number of the window (or stretch) of each, counted in the log's order.
     fitted: how many of these units come before those that are kept as test data.  whole: why motions are replayed
@@ -73,6 +75,10 @@ class WindowedLog(Cost):
     too_short: recordings that no window fits into.
     """
 
+    scene: Scene
+    space: Space
+    comparisons: tuple[Comparison, ...]
+    drives: tuple[Drive, ...]
     pieces: tuple[Piece, ...]
     order: np.ndarray
     unit: np.ndarray
@@ -84,6 +90,10 @@ class WindowedLog(Cost):
     whitener: tuple[Whitener, ...] | None = None
     spreads: tuple[np.ndarray | None, ...] = field(default=())
     too_short: tuple[str, ...] = ()
+
+    def __call__(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] cost; never NaN."""
+        return self.distances(values)[:, 0]
 
     def simulated(self, values: Any) -> np.ndarray:
         """[P, D] -> [P, K, C] compared channels through the filter of their data, in their units; NaN throughout where
@@ -287,7 +297,7 @@ def windowed_log(
     order, unit, fitted = _order(pieces, fitted_share)
     comparison = _comparison(scene, [r for r in recordings if r.name not in short], pieces, order, config)
     return WindowedLog(
-        scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
+        scene, space, (comparison,), tuple(drives),
         tuple(pieces), order, unit, fitted, why, STRETCH if why else windows.length,
         np.ones(len(order), bool),
         lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),

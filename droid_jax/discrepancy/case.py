@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.observation import Measured
 from droid_jax.cost.replay_cache import cached
 from droid_jax.cost.residuals import Comparison
+from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
 from droid_jax.identify.identifiability import IdentifiabilityConfig
@@ -25,6 +27,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS
 
+AnyCost: TypeAlias = Cost | WindowedLog  # of one recording, or of pooled logs
 NUISANCE_ITERATIONS = 2  # Gauss-Newton steps for per-recording nuisances where joints come to rest during the motion
 
 
@@ -44,7 +47,7 @@ class ResidualSet:
     nuisance_columns: [M, len(nuisances)] change of the common residual by one prior deviation of each.
     """
 
-    cost: Cost
+    cost: AnyCost
     whitened: Callable[[np.ndarray], np.ndarray]
     distances: Callable[[np.ndarray], np.ndarray]
     resampling: Resampling
@@ -157,7 +160,7 @@ def residual_set(cost: Cost, config: DiscrepancyConfig | None = None) -> Residua
 
 
 def block_residual_set(
-    cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None, least: int = FEWEST_REPEATS
+    cost: AnyCost, block: np.ndarray, config: DiscrepancyConfig | None = None, least: int = FEWEST_REPEATS
 ) -> ResidualSet:
     """The residual set, in blocks of time, of a cost over one recording of one repeat.
 
@@ -181,7 +184,7 @@ def block_residual_set(
 
 
 def _residual_set_of(
-    cost: Cost, rows: Resampling, config: DiscrepancyConfig, factor: float, slack: float
+    cost: AnyCost, rows: Resampling, config: DiscrepancyConfig, factor: float, slack: float
 ) -> ResidualSet:
     return ResidualSet(
         cost,
@@ -196,7 +199,7 @@ def _residual_set_of(
     )
 
 
-def only_comparison(cost: Cost) -> Comparison:
+def only_comparison(cost: AnyCost) -> Comparison:
     """The comparison of a cost over one recording; ValueError for several."""
     if len(cost.comparisons) != 1:
         raise ValueError(f"a residual set is of one recording, got {len(cost.comparisons)}")
@@ -258,9 +261,13 @@ class Case:
         """The case of other repeats, by role, with the same compiled replays.
 
         Raises:
-            ValueError: other commands or another clock (see `Cost.against`).
+            ValueError: a case of windows, other commands or another clock (see `Cost.against`).
         """
-        costs = [e.cost.against([recordings[role]]) for role, e in self.residual_sets.items()]
+        costs = list[Cost]()
+        for role, residual_set in self.residual_sets.items():
+            if isinstance(residual_set.cost, WindowedLog):
+                raise ValueError("a case of windows has no repeats to replace: make another case (`log_case.case_of`)")
+            costs.append(residual_set.cost.against([recordings[role]]))
         return _of_costs(costs, self.base, self.effects, self.config)
 
     def with_replay_cache(self, folder: Path) -> Case:

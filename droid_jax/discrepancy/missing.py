@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 
 from droid_jax.arguments import instance, instances
-from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.cost import make_cost
 from droid_jax.discrepancy.candidates import observable_effects
-from droid_jax.discrepancy.case import Case, comparing
+from droid_jax.discrepancy.case import AnyCost, Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit, base_model, final_refit, final_refit_due
 from droid_jax.discrepancy.log_case import case_of
@@ -111,7 +111,7 @@ def find_missing_effects(
 def search(
     split: Split,
     case: Case,
-    fine: Cost | None,
+    fine: AnyCost | None,
     start: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> tuple[Case, Verdict]:
@@ -273,7 +273,7 @@ def untouched(scene: Scene) -> Scene:
     return replace(scene, model=model, grip=None)
 
 
-def _further(known: Cost, recording: Recording, values: np.ndarray) -> Recording:
+def _further(known: AnyCost, recording: Recording, values: np.ndarray) -> Recording:
     """The motion opened further, as simulated with a model [1, D].
 
     Raises:
@@ -285,7 +285,7 @@ def _further(known: Cost, recording: Recording, values: np.ndarray) -> Recording
     return longer
 
 
-def _experiment(what: str, cost: Cost, values: np.ndarray) -> Experiment:
+def _experiment(what: str, cost: AnyCost, values: np.ndarray) -> Experiment:
     """The distance of those two of the models [K, D] that an experiment distinguishes least.
 
     Raises:

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.cost import make_cost
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreTest, project
-from droid_jax.discrepancy.case import Case, ResidualSet
+from droid_jax.discrepancy.case import AnyCost, Case, ResidualSet
 from droid_jax.discrepancy.fitting import FittedModel
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.parameters import Space
@@ -23,7 +23,7 @@ FINER = 4  # finer steps in a time step
 FIRST_ORDER_RATIO = (FINER / (FINER - 1)) ** 2
 
 
-def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> Cost | None:
+def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording) -> AnyCost | None:
     """The cost of the base model at a quarter of the time step.
 
     None if there is no discretisation error: inverse dynamics of a recording without commands takes no steps, and
@@ -56,7 +56,7 @@ def _finer(scene: Scene) -> Scene:
     return with_options(scene, timestep=float(scene.model.opt.timestep) / FINER)
 
 
-def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Cost | None) -> ResidualSet:
+def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: AnyCost | None) -> ResidualSet:
     """The residual set with `step_difference`, the change of its residuals at a quarter of the time step.
 
     Args:
@@ -78,7 +78,7 @@ def with_step_difference(residual_set: ResidualSet, model: FittedModel, fine: Co
     return replace(residual_set, step_difference=off)
 
 
-def with_step_differences(case: Case, model: FittedModel, fine: Cost | None) -> Case:
+def with_step_differences(case: Case, model: FittedModel, fine: AnyCost | None) -> Case:
     """The case with the step difference (`with_step_difference`) of its training set and of `Case.both`.
 
     fine: cost of the training recording from `with_finer_step`.

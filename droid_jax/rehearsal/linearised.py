@@ -17,7 +17,7 @@ from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.cost import Cost, make_cost, without_unused
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
-from droid_jax.discrepancy.case import Case, ResidualSet, comparing
+from droid_jax.discrepancy.case import AnyCost, Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FittedModel, base_model, model_at
 from droid_jax.discrepancy.log_case import case_of
@@ -173,7 +173,7 @@ def fine_steps(residual_set: ResidualSet, model: FittedModel, base: Space, recor
     to none (Richardson).  What plain C does not have is replayed at a quarter of the step, as the search does.
     """
 
-    def difference(finer: Cost | None) -> np.ndarray | None:
+    def difference(finer: AnyCost | None) -> np.ndarray | None:
         return with_step_difference(residual_set, model, finer).step_difference
 
     known, costs = residual_set.cost, list[Cost]()

@@ -19,11 +19,13 @@ from pendulum import TRUE, pendulum, swung
 from two_link import JOINTS, arm, measured, recording
 
 import droid_jax as dj
+from droid_jax.cost.cost import Cost
 from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
 from droid_jax.discrepancy.candidates import SENSITIVITY_STEP, observable_effects
+from droid_jax.discrepancy.case import Case, block_residual_set
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
@@ -244,6 +246,17 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert part.distances(truth[None])[0, 0] == pytest.approx(np.mean(np.abs(left[some])), rel=1e-3)
     (rollout,) = log.rollouts(truth[None])
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
+
+
+def test_a_log_of_windows_offers_only_what_it_can_do(space: Space):
+    """It was a `Cost` whose `against`, `alone` and `compared_by` failed obscurely or returned an empty cost."""
+    log = log_of(space, [swung("a", 1.0, 0.7)])
+    assert not isinstance(log, Cost) and not hasattr(log, "alone")
+    rows = block_residual_set(log.with_noise(np.ones(1), np.ones(len(log.clock), bool)), log.unit, least=1)
+    assert rows.cost.comparisons == log.comparisons
+    case = Case(rows, rows, None, space, (), DiscrepancyConfig())
+    with pytest.raises(ValueError, match="a case of windows has no repeats to replace"):
+        case.against({"train": swung("a", 1.0, 0.7)})
 
 
 def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
