@@ -209,7 +209,7 @@ def test_names_of_a_file_are_told_printable_and_cut():
 # Thresholds of the search for missing effects ----------------------------------------------
 
 FROM_ONE = {"nuisance_bound", "prior_slack", "equivalence_factor", "simplest_factor"}  # factors
-SHARES = {f.name for f in fields(SelectionConfig)} - FROM_ONE - {"resamples"}
+SHARES = {f.name for f in fields(SelectionConfig)} - FROM_ONE - {"resamples", "sensitivity_step"}
 
 
 def changed(name: str, value: Any) -> dict[str, Any]:
@@ -233,6 +233,11 @@ def test_factors_are_no_less_than_one(name: str):
             SelectionConfig(**changed(name, value))
 
 
+def test_a_sensitivity_needs_a_step():
+    with pytest.raises(ValueError, match="sensitivity_step must be above 0"):
+        SelectionConfig(sensitivity_step=0.0)
+
+
 @pytest.mark.parametrize("value", [0, -1, 1.5, "400"])
 def test_resamples_are_a_whole_number(value: Any):
     with pytest.raises(ValueError, match="resamples"):
@@ -248,6 +253,7 @@ def test_resamples_are_a_whole_number(value: Any):
         ({"noise_share": -0.1}, "noise_share"),
         ({"equivalence_factor": 0.9}, "equivalence_factor"),
         ({"prior_slack": 0.5}, "prior_slack"),
+        ({"least_test": 0}, "least_test"),
     ],
 )
 def test_blocks_that_no_log_could_have_are_refused(changes: dict[str, Any], said: str):
@@ -283,10 +289,11 @@ def test_thresholds_do_not_change_once_set():
 def test_the_thresholds_are_those_of_the_published_runs():
     """A changed default changes verdicts: then the documents' tables are of another program."""
     assert SelectionConfig() == SelectionConfig(
-        significance=0.01, nuisance_bound=3.0, prior_slack=3.0, collinear=0.9, confirmation=0.05, least_gain=0.2,
-        least_further_gain=0.4, least_share=0.05, stability=0.8, resamples=400, interval_level=0.9, bound_margin=0.02,
+        significance=0.01, nuisance_bound=3.0, prior_slack=3.0, sensitivity_step=0.3, collinear=0.9, confirmation=0.05,
+        least_gain=0.2, least_further_gain=0.4, least_share=0.05, stability=0.8, resamples=400, interval_level=0.9,
+        bound_margin=0.02,
         equivalence_factor=3.0, equivalence_doubt=0.05, equal_fit=0.05, simplest_factor=1.25, simplest_share=0.01,
         generality_factor=0.9, open_share=0.1, minimum_closed=0.4, mostly_explained=0.5, shape_interval_share=0.5,
         false_discovery_rate=0.1,
     )  # fmt: skip
-    assert BlocksConfig() == BlocksConfig(1.5, 0.5, 2 / 3, 0.2, 0.3, 0.08, 2, 1.5, 30.0)
+    assert BlocksConfig() == BlocksConfig(1.5, 0.5, 2 / 3, 0.2, 0.3, 0.08, 2, 1.5, 30.0, 4, 31, 1)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # beginnings of model fields that inverse dynamics does not read
 SAMPLES = 16  # of a random motion, on which the effect of a sensor model is tried
-SENSITIVITY_STEP = 0.3  # prior deviations of a coefficient: large against solver noise, small enough to be linear
 
 
 def observable_effects(
@@ -144,12 +143,12 @@ def sensitivities(
         residual_set: of the recording.
         values: [D] of the fitted model.
         directions: K of them.
-        at: [K] distance of each coefficient from neutral; None: `SENSITIVITY_STEP` prior deviations.
+        at: [K] distance of each coefficient from neutral; None: `SelectionConfig.sensitivity_step` deviations.
 
     Returns:
         [K, M] in one repeat's noise.  A row is NaN if its replay blew up.
     """
-    space = residual_set.cost.space
+    space, share = residual_set.cost.space, residual_set.config.sensitivity_step
     rows, sizes = [values], []
     for number, direction in enumerate(directions):
         row = values.copy()
@@ -157,7 +156,7 @@ def sensitivities(
             row[space.index(name)] = value
         p = space[direction.coefficient]
         span = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
-        step = math.copysign(min(SENSITIVITY_STEP * p.std, 0.5 * abs(span)), span)
+        step = math.copysign(min(share * p.std, 0.5 * abs(span)), span)
         size = step if at is None else at[number]
         row[space.index(direction.coefficient)] = p.mean + size
         rows.append(row)

@@ -31,6 +31,8 @@ class SelectionConfig:
             0.4 kg.)
         prior_slack: factor that widens the priors of the base parameters when sensitivities are projected.  With a
             factor of 1, 6 of 200 hinges with nothing missing had p < 0.01.
+        sensitivity_step: prior deviations of a coefficient, from neutral, for its sensitivity: large against solver
+            noise, small enough to be linear.
         collinear: absolute cosine of two sensitivities above which both candidates are refitted.
 
     The validation test of an effect:
@@ -70,6 +72,7 @@ class SelectionConfig:
     significance: float = 0.01
     nuisance_bound: float = 3.0
     prior_slack: float = 3.0
+    sensitivity_step: float = 0.3
     collinear: float = 0.9
     confirmation: float = 0.05
     least_gain: float = 0.2
@@ -93,12 +96,13 @@ class SelectionConfig:
 
     def __post_init__(self) -> None:
         above_one = ("nuisance_bound", "prior_slack", "equivalence_factor", "simplest_factor")
-        shares = [n for n in self.__dataclass_fields__ if n not in (*above_one, "resamples")]
+        shares = [n for n in self.__dataclass_fields__ if n not in (*above_one, "resamples", "sensitivity_step")]
         check_fields(
             self,
             **dict.fromkeys(above_one, partial(number, least=1)),
             **dict.fromkeys(shares, partial(number, least=0, most=1)),
             resamples=partial(whole, least=1),
+            sensitivity_step=partial(number, above=0, most=1),
         )
 
 
@@ -122,6 +126,9 @@ class BlocksConfig:
     equivalence_factor: as `SelectionConfig.equivalence_factor`; closer to one, since U of a block includes the noise.
     prior_slack: as `SelectionConfig.prior_slack`.  A residual that the priors hold back is alike in every block and
         would look like an effect.  (p < 0.2 with nothing missing: 8 of 40 Panda logs, 19 with a factor of 1.)
+    least_test: least number of windows, or stretches of whole motions, that are kept as test data.
+    start_draws: number of draws from the prior that are tried as starts of a base fit of windows.
+    best_draws: number of the best of them that the fit starts from, beside the prior's mean.
     """
 
     correlation_times: float = 1.5
@@ -133,13 +140,17 @@ class BlocksConfig:
     cross_validated: int = 2
     equivalence_factor: float = 1.5
     prior_slack: float = 30.0
+    least_test: int = 4
+    start_draws: int = 31
+    best_draws: int = 1
 
     def __post_init__(self) -> None:
         check_fields(
             self,
             **dict.fromkeys(("correlation_times", "shortest"), partial(number, least=0)),
             **dict.fromkeys(("equivalence_factor", "prior_slack"), partial(number, least=1)),
-            cross_validated=partial(whole, least=0),
+            **dict.fromkeys(("cross_validated", "start_draws", "best_draws"), partial(whole, least=0)),
+            least_test=partial(whole, least=1),
             **dict.fromkeys(
                 ("fitted_share", "noise_share", "refit_share", "least_gain"), partial(number, least=0, most=1)
             ),

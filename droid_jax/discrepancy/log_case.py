@@ -18,7 +18,7 @@ from droid_jax.cost.cost import check_known
 from droid_jax.cost.lone_log import LoneLog, lone_log
 from droid_jax.cost.windowed_log import WindowedLog, windowed_log
 from droid_jax.discrepancy.case import Case, comparing, make_case, per_recording_nuisances, restrained, unbounded
-from droid_jax.discrepancy.config import FEWER_TRIALS, DiscrepancyConfig
+from droid_jax.discrepancy.config import FEWER_TRIALS, BlocksConfig, DiscrepancyConfig
 from droid_jax.discrepancy.fitting import refit
 from droid_jax.discrepancy.log_noise import Report, noise_of, with_blocks
 from droid_jax.discrepancy.statistics import OUTSIDE, fewest_blocks, in_turns, interleaved
@@ -32,9 +32,6 @@ from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 from droid_jax.simulate.windows import held, why_whole
 
 PARTS = 2  # training and validation
-START_DRAWS = 31  # of the base parameters' prior, from which starts are selected; with its mean one block of a CPU
-BEST_DRAWS = 1  # number of draws that a fit starts from, beside the mean
-LEAST_TEST_UNITS = 4  # windows, or stretches of a whole motion, of a test part
 
 
 def make_log(
@@ -234,7 +231,7 @@ def windowed_case(
     # Whitened with the spread of the initial states, residuals of windows have the correlation time of the noise.
     noise = noise_of(log.about(first), base, effects, end, rough, first, progress)
     log = log.about(noise.values)
-    plan = planned(log, noise.block, config.blocks.shortest, judged is None)
+    plan = planned(log, noise.block, config.blocks, judged is None)
     sets = [
         with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), noise.deviation, block, config, 1)
         for which, block in zip(("every other block", "the blocks between", "last third"), plan.blocks, strict=False)
@@ -308,7 +305,7 @@ def _first_values(
 ) -> np.ndarray:
     """[D] of the base model, fitted from the prior's mean and from the best of some draws of the prior."""
     whole, inside = log.space, log.clock < end
-    drawn = np.random.default_rng(config.seed).normal(size=(START_DRAWS, len(base)))
+    drawn = np.random.default_rng(config.seed).normal(size=(config.blocks.start_draws, len(base)))
     rows = whole.embed(base, np.concatenate([base.mean[None], base.from_search(drawn)]))
     residual = log.residual(whole.mean)[inside]
     if not np.isfinite(residual).all():
@@ -320,7 +317,7 @@ def _first_values(
     block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
     rough = with_blocks(log, np.sqrt(np.mean(residual**2, axis=0)), block, config, 1)
     cost = np.nan_to_num(np.sum(rough.whitened(rows) ** 2, axis=1), nan=np.inf)
-    starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[:BEST_DRAWS]]])
+    starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[: config.blocks.best_draws]]])
     return refit(rough, base, (), starts, config.refine, progress=progress).values
 
 
@@ -335,7 +332,7 @@ class BlockPlan:
     limits: tuple[str, ...]
 
 
-def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -> BlockPlan:
+def planned(log: WindowedLog, length: float, config: BlocksConfig, with_test: bool) -> BlockPlan:
     """The blocks of a log's units (windows, or stretches of whole motions), at least eight in each part.
 
     If the log is too short, the blocks are shortened first; then the test part is given up, then some of the blocks.
@@ -343,17 +340,17 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
     Args:
         log: the log.
         length: s, of a block.
-        shortest: s, least length of a shortened block.
+        config: with the least length of a shortened block.
         with_test: whether the last units are test data.
 
     Raises:
         ValueError: fewer than two blocks in each part.
     """
-    seconds, limits = log.unit_seconds, list[str]()
+    seconds, shortest, limits = log.unit_seconds, config.shortest, list[str]()
     fitted, total = log.fitted, int(log.unit.max()) + 1
     tested = with_test and total > fitted
     needed = PARTS * FEWEST_REPEATS * max(1, math.ceil(shortest / seconds - 1e-6))
-    if tested and fitted < needed <= total - LEAST_TEST_UNITS:  # a smaller test part rather than none
+    if tested and fitted < needed <= total - config.least_test:  # a smaller test part rather than none
         fitted = needed
     each = _each(fitted, length, seconds)
     if each < FEWEST_REPEATS and _each(fitted, shortest, seconds) >= FEWEST_REPEATS:

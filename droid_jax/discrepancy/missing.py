@@ -65,12 +65,10 @@ def find_missing_effects(
     Args:
         scene: the robot.
         space: base parameters with nuisances, e.g. `found.full` of an identification.
-        recordings: one of the following.
-
-            * Recordings for training, validation and optionally test, each with eight repeats or more.
-            * One recording with sixteen repeats or more, whose second half is for validation.
-            * A log of one repeat without commands, optionally with a second one as test data.
-            * Commanded logs with fewer repeats, whose windows are for training and validation in turns.
+        recordings: for training, validation and optionally test, each with eight repeats or more.  Or one recording
+            with sixteen repeats or more, whose second half is for validation.  Or a log of one repeat without commands,
+            optionally with a second one as test data.  Or commanded logs with fewer repeats, whose windows are for
+            training and validation in turns.
         effects: to test; None for all effects of the library (`droid_jax.model.effects.registry`) that can change the
             compared channels.
         start: [D] physical values over `space`, e.g. `found.best`, where the base fit begins; None: CMA-ES searches for

@@ -24,9 +24,9 @@ from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
-from droid_jax.discrepancy.candidates import SENSITIVITY_STEP, observable_effects
+from droid_jax.discrepancy.candidates import observable_effects
 from droid_jax.discrepancy.case import Case, block_residual_set
-from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
+from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
@@ -265,7 +265,8 @@ def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
     The size is that of the score test, at which slow commands must be limited.
     """
     effects = library(scene(), ["profile_speed"])
-    whole, theta = joined(space, effects), {"profile_speed[swing]": SENSITIVITY_STEP * effects[0].parameters[0].std}
+    step = SelectionConfig().sensitivity_step * effects[0].parameters[0].std
+    whole, theta = joined(space, effects), {"profile_speed[swing]": step}
     assert effects[0].profile is not None and theta["profile_speed[swing]"] == pytest.approx(1.5)
     log = log_of(whole, [swung("a", 1.0, 0.7)], effects=effects)
     windows, command = log.pieces[0].windows, log.drives[0].command
@@ -422,7 +423,7 @@ def plan_of(units: int, fitted: int, length: float, with_test: bool = True) -> A
     log: Any = SimpleNamespace(
         unit=np.repeat(np.arange(units), 4), fitted=fitted, unit_seconds=1.0, comparisons=[SimpleNamespace(name="log")]
     )
-    return planned(log, length, BlocksConfig().shortest, with_test)
+    return planned(log, length, BlocksConfig(), with_test)
 
 
 def test_blocks_are_whole_windows_that_take_turns():
