@@ -43,15 +43,15 @@ def found() -> Small:
 
 @pytest.fixture(scope="module")
 def lost(found: Small) -> SelectionStep:
-    """The first step, as if none of its models had passed."""
+    """The first step, as if no model had passed."""
     _, info = selection_step(SearchState(found.base), problem_of(found))
     assert info is not None and info.selected is not None
     return replace(info, selected=None, chosen=None)
 
 
 @pytest.mark.slow
-def test_an_extended_model_is_fitted_without_what_the_base_fit_found(found: Small) -> None:
-    """The preload, and the base parameters that it had bent."""
+def test_a_fit_from_the_prior_finds_the_truth_without_the_base_fit(found: Small) -> None:
+    """It finds the preload, and the base parameters that were biased without it."""
     case = found.case
     (preload,) = candidates(e for e in case.effects if e.name == "hinge_preload")
     model = fitted_from_prior(case.train, case.base, (preload,), case.config, quiet)
@@ -61,7 +61,7 @@ def test_an_extended_model_is_fitted_without_what_the_base_fit_found(found: Smal
     assert fitted["forearm_mass"] == pytest.approx(TRUTH["forearm_mass"], rel=0.05)
 
 
-def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
+def test_shape_parameters_are_fixed_in_the_search_and_free_in_the_refinement(
     found: Small, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen, case = dict[str, Any](), found.case
@@ -83,7 +83,7 @@ def test_shapes_are_held_while_the_search_goes_and_free_in_the_refinement(
 
 
 @pytest.mark.slow
-def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_base_fit_can_begin_at_given_values(found: Small, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fitting, "cma_search", lambda *a, **k: pytest.fail("there is a start"))
     case = found.case
     start = found.base.values[case.full_space.columns(case.base)]
@@ -92,7 +92,7 @@ def test_a_base_fit_may_begin_at_an_earlier_one(found: Small, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(found: Small, lost: SelectionStep) -> None:
+def test_a_step_that_selects_nothing_refits_its_best_model_from_the_prior(found: Small, lost: SelectionStep) -> None:
     reported = list[tuple[str, Any]]()
     problem = problem_of(found, progress=lambda stage, value: reported.append((stage, value)))
     again, notes = restart_from_prior(problem, lost)
@@ -103,12 +103,12 @@ def test_a_step_without_a_winner_has_its_best_model_fitted_from_the_prior_on(fou
 
 
 @pytest.mark.slow
-def test_what_the_basin_takes_by_itself_is_no_effects(
+def test_a_gain_of_the_base_model_in_another_basin_is_no_gain_of_an_effect(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The base model is equivalent once it begins where the winner ended: it was the basin, and nothing is named."""
+    """The base model is as good as the winner in the winner's basin, so nothing is named."""
     best = min(lost.tried, key=lambda m: m.refined.objective)
-    # A worse fit all the same: it is the other motion that counts.
+    # Although its fit is worse: the validation motion decides.
     worse = replace(best.refined, objective=2 * found.base.refined.objective)
     there = replace(best, parts=(), space=found.base.space, refined=worse)
     usual = candidate_fits.refit
@@ -121,7 +121,7 @@ def test_what_the_basin_takes_by_itself_is_no_effects(
 
 
 @pytest.mark.slow
-def test_a_basin_in_which_the_base_model_blows_up_has_nothing_to_say(
+def test_the_base_model_is_kept_if_it_blows_up_in_another_basin(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usual = Problem.discrepancy
@@ -137,7 +137,7 @@ def test_a_basin_in_which_the_base_model_blows_up_has_nothing_to_say(
 
 
 @pytest.mark.slow
-def test_no_fit_from_the_prior_on_where_there_is_a_winner_or_no_time(
+def test_there_is_no_fit_from_the_prior_after_a_selection_or_without_time(
     found: Small, lost: SelectionStep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search, "fitted_from_prior", lambda *a: pytest.fail("was not asked for"))
@@ -170,8 +170,8 @@ def both(found: Small) -> FinalModel:
     return refitted(found.case, found.verdict.model)
 
 
-def test_it_is_the_best_of_both_motions(found: Small, both: FinalModel):
-    """No worse than the search's model by their common log posterior, and where that is flat."""
+def test_the_final_refit_is_the_optimum_of_both_motions(found: Small, both: FinalModel):
+    """Its common log posterior is no lower than that of the search's model, and flat."""
     case, alone = found.case, found.verdict.model
     assert (
         both.fitted_to == (case.train, case.validation)
@@ -194,7 +194,7 @@ def test_it_is_the_best_of_both_motions(found: Small, both: FinalModel):
             assert objective(moved) > both.model.refined.objective - RefineConfig().tolerance, name
 
 
-def test_two_motions_constrain_more_than_one(found: Small, both: FinalModel):
+def test_two_motions_constrain_parameters_better_than_one(found: Small, both: FinalModel):
     alone = found.verdict.model
     one, two = (np.diag(np.linalg.inv(m.refined.hessian)) for m in (alone, both.model))
     assert np.all(two < 1.02 * one) and np.min(two / one) < 0.8
@@ -205,7 +205,7 @@ def test_two_motions_constrain_more_than_one(found: Small, both: FinalModel):
     assert low[at] < PRELOAD < high[at]
 
 
-def test_without_an_effect_in_blocks_or_unconverged_it_is_the_searchs_own(found: Small):
+def test_the_model_is_unchanged_without_effects_for_blocks_and_without_convergence(found: Small):
     case, model = found.case, found.verdict.model
     assert final_refit_due(case.train, model) and not final_refit_due(case.train, found.base)
     base = refitted(case, found.base)
@@ -218,7 +218,7 @@ def test_without_an_effect_in_blocks_or_unconverged_it_is_the_searchs_own(found:
     assert kept.model is model and kept.fitted_to == (case.train,) and kept.not_made
 
 
-def test_the_file_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path):
+def test_the_file_lists_the_recordings_of_the_final_refit(found: Small, both: FinalModel, tmp_path: Path):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
     final = json.loads((tmp_path / GAP).read_text())["final_model"]
     assert final["fitted_to"] == ["train", "validation"]
@@ -244,12 +244,12 @@ def test_a_final_model_that_blows_up_has_no_discrepancy_in_the_file(found: Small
 
 
 def final_model_of(page: str) -> tuple[str, str] | None:
-    """What the page says of a final model of its own: its U as data, and the sentence."""
+    """U of the final model on the page as data, and the sentence about it."""
     found = re.search(r'<p[^>]*id="final-model" data-value="([^"]*)">(.*?)</p>', page, re.DOTALL)
     return None if found is None else (found[1], found[2])
 
 
-def test_the_page_says_what_it_is_fitted_to(found: Small, both: FinalModel, tmp_path: Path, quick: None):
+def test_the_page_names_the_recordings_of_the_final_refit(found: Small, both: FinalModel, tmp_path: Path, quick: None):
     write_gap(tmp_path, found.case, found.verdict, both, MORE)
     said = final_model_of(write_report(tmp_path).read_text())
     assert said is not None and "“train” and “validation”" in said[1]
