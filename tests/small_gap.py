@@ -1,6 +1,7 @@
-"""A small search for a missing effect, for the tests of its command and of what it writes.
+"""A small search for a missing effect, for tests of the search, its command and its files.
 
-experiments/bench.xml (an arm of two links and a driven door), short motions, and a hidden preload of the hinge.
+The scene is experiments/bench.xml, an arm of two links and a driven door.  Motions are short.  A preload of the hinge
+is hidden in the synthetic robot.
 """
 
 from __future__ import annotations
@@ -63,14 +64,14 @@ def write_parameters(folder: Path) -> Path:
 
 
 def small_scene() -> tuple[Scene, Space]:
-    """As the command line makes it."""
+    """The scene and the parameters, as the command line makes them."""
     scene = load_scene(SCENE, object_joint="door")
     with tempfile.TemporaryDirectory() as folder:
         return scene, load_parameters(write_parameters(Path(folder)), scene)
 
 
 def demonstration(name: str) -> Recording:
-    """ "train" and "validation" open and close the door at different speeds; so does "test", less far."""
+    """A motion that opens and closes the door; the three roles differ in speed and angle."""
     t = np.arange(0.0, SECONDS, 0.002)
     period, reach, pace = {"train": (1.5, 0.4, 2.0), "validation": (3.0, 0.35, 1.5), "test": (2.5, 0.3, 1.0)}[name]
     arm = [0.5 * np.sin(pace * t), 0.6 * np.sin(1.4 * pace * t)]
@@ -82,7 +83,7 @@ def demonstration(name: str) -> Recording:
 
 @functools.cache
 def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
-    """What the synthetic robot measures."""
+    """A recording of the synthetic robot with hidden effects [N m]."""
     scene, space = small_scene()
     seed = 1 + ("train", "validation", "test").index(name)
     config = SyntheticRobotConfig(repeats=repeats, timestep=0.00025)
@@ -91,7 +92,7 @@ def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: floa
 
 
 def quiet(stage: str, value: object) -> None:
-    """Progress that nobody sees."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +107,13 @@ class Small:
 
     @property
     def own(self) -> FinalModel:
-        """The search's own model, of the first motion alone."""
+        """The final model without a final refit."""
         return FinalModel(self.verdict.model, (self.case.train,))
 
 
 @functools.cache
 def small() -> Small:
-    """The search of this session."""
+    """The search, made once for all tests."""
     recordings = {name: record(name) for name in ("train", "validation")}
     scene, space = small_scene()
     case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
@@ -121,7 +122,7 @@ def small() -> Small:
 
 
 def problem_of(found: Small, deadline: float | None = None, progress: Progress = quiet) -> Problem:
-    """What every step of the search is given."""
+    """The constants of the search, for single steps."""
     before = found.case.validation.discrepancy_at(found.base.values)
     asked = directions_of(candidates(found.case.effects))
     return Problem(found.case, found.base, before, FLOOR, asked, deadline, progress)
@@ -130,7 +131,7 @@ def problem_of(found: Small, deadline: float | None = None, progress: Progress =
 def largest_t(scores: np.ndarray) -> tuple[np.ndarray, float]:
     """[K] t of each of K directions with scores [K, N], and the p-value of the largest |t| among them.
 
-    As the textbook has it: the search's own tests are put beside it.
+    This is the textbook test, to which the tests of the search are compared.
     """
     t = t_values(scores, sign_flips(scores.shape[1]))
     largest = np.max(np.abs(t), axis=1)

@@ -225,7 +225,7 @@ def windowed_case(
         judged = windowed_log(scene, unbounded(whole, nuisances), test, compare, judging, effects, whole=at_once)
     end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # no posterior is needed yet
     if start is None:
-        first = _first_values(log, base, effects, end, rough, progress)
+        first = _first_values(log, base, end, rough, progress)
     else:
         first = whole.embed(base, np.clip(start, base.low, base.high)[None])[0]
     # Whitened with the spread of the initial states, residuals of windows have the correlation time of the noise.
@@ -298,7 +298,6 @@ def _end_of(log: WindowedLog) -> float:
 def _first_values(
     log: WindowedLog,
     base: Space,
-    effects: Sequence[Effect],
     end: float,
     config: DiscrepancyConfig,
     progress: Report = None,

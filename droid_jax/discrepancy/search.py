@@ -88,7 +88,7 @@ def search_effects(
     state = SearchState(base)
     while not state.finished:
         state, _ = selection_step(state, problem)
-    tested = state.model if state.steps and state.steps[-1].selected is None else None  # model of the last score test
+    last_scored = state.model if state.steps and state.steps[-1].selected is None else None
     state = pair_step(state, problem)
     model = pruned(problem, state.model)
     model, converging = converged_model(problem, model)
@@ -100,7 +100,9 @@ def search_effects(
         model,
         state.steps,
         discretisation_error,
-        exhausted=state.exhausted if tested is not None and tested.keys == model.keys else _explained(problem, model),
+        exhausted=state.exhausted
+        if last_scored is not None and last_scored.keys == model.keys
+        else _explained(problem, model),
         failed=notes.failed,
         not_tried=notes.not_tried,
     )
@@ -129,7 +131,7 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     """One selection step.
 
     Returns:
-        The next state, and the step's tests and fits; None if there is no direction to test.
+        The next state, and the step's tests and fits; None if the model has `max_effects` or all effects.
     """
     model, case = state.model, problem.case
     if len(model.parts) >= case.config.max_effects:
@@ -148,11 +150,11 @@ def selection_step(state: SearchState, problem: Problem) -> tuple[SearchState, S
     if not model.parts:
         info, more = restart_from_prior(problem, info)
         notes += more
-    known = replace(state, steps=(*state.steps, info), exhausted=exhausted, notes=state.notes + notes)
+    after = replace(state, steps=(*state.steps, info), exhausted=exhausted, notes=state.notes + notes)
     if info.selected is None:
-        return replace(known, finished=True), info
+        return replace(after, finished=True), info
     model, notes = converged_model(problem, info.selected)
-    return replace(known, model=model, notes=known.notes + notes), info
+    return replace(after, model=model, notes=after.notes + notes), info
 
 
 def open_directions(asked: Sequence[ScoreDirection], model: FittedModel) -> tuple[ScoreDirection, ...]:
@@ -200,7 +202,7 @@ def restart_from_prior(problem: Problem, done: SelectionStep) -> tuple[Selection
     A missing effect may have biased the base fit into a wrong basin.  The right effect then explains the training
     recording but not the validation recording.  If it is selected after a fit from the prior, the other models and the
     base model are fitted in that basin too.  A gain of the base model there does not count for an effect.  The step is
-    not repeated for logs, whose inverse dynamics is smooth and has one basin.
+    not repeated for logs: inverse dynamics is smooth in the parameters, and windows nearly are.
     """
     case, base = problem.case, problem.base
     if done.selected is not None or not done.tried or not case.train.resampling.repeated:
