@@ -20,7 +20,8 @@ from droid_jax.discrepancy.results import gap_json
 from droid_jax.discrepancy.search import SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
-from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worsened
+from droid_jax.discrepancy.verdict import Conclusion, Verdict, closes_too_little, conclude, worsened
+from droid_jax.files import LOST
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 
