@@ -262,7 +262,10 @@ def conclude(
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
-        doubts=(*doubts(case.train, model, case.natural_bounds), *worsened(discrepancies, model, config)),
+        doubts=(
+            *doubts(case.train, model, case.natural_bounds),
+            *worsened(discrepancies, model, discretisation_error, config),
+        ),
     )
     return unnamed(case, verdict) if closes_too_little(verdict) else verdict
 
@@ -312,11 +315,19 @@ def _discrepancies(
 
 
 def worsened(
-    discrepancies: Mapping[str, tuple[float, float]], model: FittedModel, config: SelectionConfig
+    discrepancies: Mapping[str, tuple[float, float]],
+    model: FittedModel,
+    discretisation_error: float,
+    config: SelectionConfig,
 ) -> tuple[str, ...]:
-    """A doubt if the effects increase U on the test recording by `SelectionConfig.least_gain` or more."""
+    """A doubt if the effects increase U on the test recording by more than `SelectionConfig.least_gain`.
+
+    There is none if U with the effects is within the error of the time step.
+    """
     before, after = discrepancies.get("test", (0.0, 0.0))
     if not model.parts or after <= (1 + config.least_gain) * max(before, 0.0):
+        return ()
+    if not beyond_step_error(after, discretisation_error):
         return ()
     return (f"the test recording is matched worse with it, U {before:.3g} before and {after:.3g} after",)
 

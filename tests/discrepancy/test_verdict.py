@@ -338,7 +338,11 @@ def test_a_worse_match_of_the_test_recording_is_a_doubt(found: Small):
     model = found.verdict.model
     assert model.parts and found.verdict.doubts == ()
     config = SelectionConfig()
-    assert worsened({"test": (1.0, 1.1)}, model, config) == worsened({"validation": (0.1, 0.2)}, model, config) == ()
-    assert worsened({"test": (0.1, 0.2)}, replace(model, parts=()), config) == ()
-    (said,) = worsened({"test": (0.1155, 1.0168)}, model, config)
+    assert worsened({"test": (1.0, 1.1)}, model, 0.0, config) == ()
+    assert worsened({"validation": (0.1, 0.2)}, model, 0.0, config) == ()
+    assert worsened({"test": (0.1, 0.2)}, replace(model, parts=()), 0.0, config) == ()
+    (said,) = worsened({"test": (0.1155, 1.0168)}, model, 0.01, config)
     assert said == "the test recording is matched worse with it, U 0.116 before and 1.02 after"
+    # A U about zero, below the discretisation error, was called worse.
+    assert worsened({"test": (-0.001, 0.005)}, model, 0.01, config) == ()
+    assert len(worsened({"test": (-0.001, 0.05)}, model, 0.01, config)) == 1
