@@ -245,7 +245,9 @@ def identify_config(command: Identify) -> IdentifyConfig:
     from droid_jax.identify.pipeline import IdentifyConfig
 
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
+    fewer = {"samples": 64} if command.preset == "quick" else {}
     return IdentifyConfig(
+        **fewer,
         engine=command.engine,
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),

@@ -18,8 +18,7 @@ from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, names_of
 
-# Candidates whose one-step fits share batches: two starts with eight candidate steps each fill two blocks of a CPU.
-ONE_STEP_BATCH = 4
+ONE_STEP_BATCH = 12  # candidates whose one-step fits share batches: few of them do not fill a block of a CPU
 Start = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 
 
@@ -101,9 +100,14 @@ def search_refit(
 
 
 def staged_refit(
-    problem: Problem, starts: Sequence[Start], target: float, what: str, note: str = ""
+    problem: Problem,
+    starts: Sequence[Start],
+    target: float,
+    what: str,
+    note: str = "",
+    one_step: tuple[float, Sequence[float]] | None = None,
 ) -> tuple[list[FittedModel], Notes]:
-    """Refit models one after the other.  A fit that cannot reach the target objective stops early.
+    """Refit models one after the other.  A fit that cannot reach the target objective stops early or is not begun.
 
     Args:
         problem: constants of the search.
@@ -111,15 +115,20 @@ def staged_refit(
         target: objective to reach; the best one of the models replaces it when it is lower.
         what: name of the models that are skipped when time runs out, for the notes.
         note: addition to the models' names, for the progress.
+        one_step: objective without the effects, and that of each model after one step.  A model whose step is hopeless
+            by the rule that gives up a refit (`RefineConfig.give_up`) is not refitted.  None: all are refitted.
     """
-    models, failed = list[FittedModel](), list[str]()
+    models, failed, config = list[FittedModel](), list[str](), problem.case.config.refit
     for number, (parts, start) in enumerate(starts):
         if number and problem.late:
             return models, Notes(tuple(failed)) + _skipped(len(starts) - number, len(starts), what)
         target = min([target, *(m.refined.objective for m in models)])
-        config = replace(problem.case.config.refit, target_objective=target)
+        if one_step is not None:
+            before, reached = one_step[0], one_step[1][number]
+            if config.give_up * (before - reached) < reached - target:
+                continue
         try:
-            models.append(search_refit(problem, parts, start, config, note))
+            models.append(search_refit(problem, parts, start, replace(config, target_objective=target), note))
         except NotReplayed:
             failed.append(names_of(p.key for p in parts))
     return models, Notes(tuple(failed))

@@ -177,13 +177,16 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     """Refit and test the best candidates of a score test, and then those collinear with the selected one."""
     case, config = problem.case, problem.case.config
     ranked = proposals(found, model.residuals, case.full_space)
-    begun = SelectionStep(found, model.keys, tuple(ranked))
     fits, notes = proposals_after_one_step(problem, model, ranked[: config.one_step_fits], found)
     sure, others = fits[: config.sure_refits], fits[config.sure_refits :]
     others = sorted(others, key=lambda fit: fit[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda fit: fit[1])[: config.full_refits]
+    begun = SelectionStep(found, model.keys, tuple(ranked), tuple(p for _, _, p in best))
     starts = [((*model.parts, *p.parts), values) for values, _, p in best]
-    tried, more = staged_refit(problem, starts, target_objective(problem, model), "candidates not refitted")
+    certain = {id(p) for _, _, p in sure}
+    reached = [-np.inf if id(p) in certain else objective for _, objective, p in best]
+    target, before = target_objective(problem, model), model.refined.objective
+    tried, more = staged_refit(problem, starts, target, "candidates not refitted", one_step=(before, reached))
     notes += more
     done = _decided(problem, model, begun, tried)
     near = _collinear_candidates(done, config.selection.collinear)
@@ -292,7 +295,8 @@ def _pairs(problem: Problem, model: FittedModel, first: SelectionStep) -> tuple[
     """Refit and test the best pairs of candidates of the first step, and the model that stands if it has several."""
     case, config = problem.case, problem.case.config
     best = sorted(first.tests, key=lambda t: t.discrepancy_validation)[: config.full_refits]
-    among = {key for t in best for key in t.keys}
+    keys = dict.fromkeys([key for one in (*best, *first.nearest) for key in one.keys])
+    among = {*list(keys)[: config.full_refits]}
     ranked = proposals(first.score_test, problem.base.residuals, case.full_space, number=2, among=among)
     ranked = [p for p in ranked if set(p.keys) != set(model.keys)][: config.pair_refits]
     starts = [(p.parts, p.start(case.full_space, problem.base.values)) for p in ranked]

@@ -94,6 +94,7 @@ class SelectionStep:
     score_test: of the model before the step.
     before: the effects in it.
     ranked: proposals of the score test, the best first.
+    nearest: proposals with the best one-step fits, refitted or not.
     tried, tests: the refitted models and their validation tests.
     selected, chosen: the selected model and its test, or None.
     """
@@ -101,6 +102,7 @@ class SelectionStep:
     score_test: ScoreTest
     before: Keys = ()
     ranked: tuple[Proposal, ...] = ()
+    nearest: tuple[Proposal, ...] = ()
     tried: tuple[FittedModel, ...] = ()
     tests: tuple[ValidationTest, ...] = ()
     selected: FittedModel | None = None

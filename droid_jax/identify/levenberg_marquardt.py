@@ -1,10 +1,10 @@
 """Levenberg-Marquardt in batches: one iteration of several starts at once, in search coordinates.
 
-An iteration is one batch of central differences, then batches of trial steps with that Jacobian for as long as they
-pay.  A trial differs from the next in its damping, its length and its path: straight in search coordinates, or straight
-in physical units.  Residuals are close to linear in masses, springs and damping, whose search coordinate is their
-logarithm; where two of them trade with each other (door and knob turn about the same hinge), the valley between them is
-straight in physical units alone.
+An iteration is one batch of central differences, then batches of trial steps for as long as they pay.  Each of them
+corrects the Jacobian by what the trials before it have shown (`secant_slopes`).  A trial differs from the next in its
+damping, its length and its path: straight in search coordinates, or straight in physical units.  Residuals are close to
+linear in masses, springs and damping, whose search coordinate is their logarithm; where two of them trade with each
+other (door and knob turn about the same hinge), the valley between them is straight in physical units alone.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ class LevenbergMarquardtConfig:
     """Settings of an iteration.
 
     step: half-width of the first central differences, search units.
-    smallest_step: and of later ones at least, search units (below it solver noise would show).
+    smallest_step: and of later ones at least, search units (below it solver noise would show); trials that are nearer
+      correct no slopes either.
     longest_step: largest component of a candidate step, search units: further off the slopes no longer hold.
     least_ratio: a path that is straight in physical units takes a parameter to no less than this share of itself.
     main_prior: prior deviation of parameters of interest, search units.
-    chord: a Jacobian serves another batch of trials while the last lowered the objective by this share.
-    chords: batches of trials at most with one Jacobian.
+    chord: without new differences, a Jacobian serves another batch of trials while the last lowered the objective by
+      this share.
+    chords: batches of trials at most between two batches of differences.
+    secant_ridge: of the correction of a Jacobian by trials; limits what two nearly parallel steps may ask for.
     dampings: factors on the last damping that a batch of trials tries; with lengths and both paths 32 trials, the block
       of a CPU in MJX.
     lengths: shares of the whole step that it tries.
@@ -49,7 +52,8 @@ class LevenbergMarquardtConfig:
     least_ratio: float = 0.05
     main_prior: float = 4.0
     chord: float = 0.03
-    chords: int = 3
+    chords: int = 6
+    secant_ridge: float = 0.01
     dampings: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3, 1e4)
     lengths: tuple[float, ...] = (1.0, 0.5)
     spreads: int = 2
@@ -69,6 +73,7 @@ class LevenbergMarquardtConfig:
             least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
             chords=partial(whole, least=1),
+            secant_ridge=partial(number, above=0),
             dampings=several(partial(number, above=0)),
             lengths=several(partial(number, above=0, most=1)),
             spreads=partial(whole, least=0),
@@ -88,6 +93,13 @@ class Starts:
     def rows(self, keep: Any) -> Starts:
         """The starts that `keep` indexes."""
         return Starts(*(getattr(self, f)[keep] for f in Starts.__dataclass_fields__))
+
+    def with_rows(self, at: np.ndarray, others: Starts) -> Starts:
+        """These starts, and at the rows [N] `at` the others."""
+        out = self.rows(np.arange(len(self.x)))
+        for field in Starts.__dataclass_fields__:
+            getattr(out, field)[at] = getattr(others, field)
+        return out
 
 
 def curvature(jacobian: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -134,6 +146,35 @@ def damped_steps(
     return out.reshape(-1, len(slope))
 
 
+def secant_slopes(
+    jacobian: np.ndarray, prior: np.ndarray, steps: np.ndarray, changes: np.ndarray, ridge: float
+) -> np.ndarray:
+    """Slopes [M, D] that agree with known differences, and change as little from `jacobian` as that allows.
+
+    Broyden's update (1965) for several differences at once.  How little is counted in units of each parameter's own
+    deviation, so that sharp parameters are not changed more than others.  Short steps count more: the longer a step,
+    the more of its difference is curvature.
+
+    Args:
+        jacobian: [M, D].
+        prior: [D] prior deviations.
+        steps: [N, D] from where the slopes are wanted.
+        changes: [N, M] of the residuals; NaN where a replay failed.
+        ridge: share of the shortest step's weight that is noise.
+    """
+    scale = np.sqrt(np.einsum("md,md->d", jacobian, jacobian) + prior**-2)
+    length = np.linalg.norm(steps * scale, axis=1)
+    known = np.isfinite(changes).all(axis=1) & (length > 0)
+    if not known.any():
+        return jacobian
+    steps, changes, length = steps[known], changes[known], length[known]
+    weight = np.min(length) / length**2
+    ways = steps * scale * weight[:, None]
+    wanted = (changes - steps @ jacobian.T) * weight[:, None]
+    change = ways.T @ np.linalg.solve(ways @ ways.T + ridge * np.eye(len(ways)), wanted)
+    return jacobian + change.T * scale
+
+
 def principal_axes(cov: np.ndarray, longest: float) -> np.ndarray:
     """[D, D] columns: principal axes of a covariance, one deviation long, no entry beyond `longest`."""
     variance, axes = np.linalg.eigh(cov)
@@ -148,6 +189,8 @@ def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 class DampedProblem:
     """Residuals and prior in search coordinates, with what an iteration does; counts iterations and replays.
 
+    It keeps the slopes of the last iteration, corrected to where that ended (`slopes`).
+
     before: a problem whose counts are gone on with.
     """
 
@@ -161,6 +204,7 @@ class DampedProblem:
         self.log_width = np.array([p.log_width if p.scaling is Scaling.LOG else 0.0 for p in space.parameters])
         self.evaluations = before.evaluations if before else 0
         self.iterations = before.iterations if before else 0
+        self._known = np.zeros((0, len(space))), np.zeros((0, 0, len(space)))  # starts [S, D], slopes [S, M, D] there
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """x clipped to the bounds."""
@@ -202,40 +246,69 @@ class DampedProblem:
         return Starts(x, residual, self.objective(x, residual), np.full(len(x), 1e-3), widths)
 
     def start_with_slopes(self, x: np.ndarray) -> tuple[Starts, np.ndarray]:
-        """`start` of one start [1, D] and its `jacobian` [1, M, D], of one batch of replays."""
+        """`start` of fresh starts [S, D] and their `jacobian` [S, M, D], of one batch of replays."""
         widths = np.full(x.shape, self._config.step)
-        up, down = self._around(x, widths)
-        residual = self.replay(np.concatenate([x, up[0], down[0]]))
-        state = self.begun(x, residual[:1])
-        return state, self._slopes(
-            *self._apart(np.stack([up, down]), residual[1:].reshape(2, *up.shape[:2], -1), state)
-        )
+        points = np.stack(self._around(x, widths))
+        residual = self.replay(np.concatenate([x, points.reshape(-1, x.shape[1])]))
+        state = self.begun(x, residual[: len(x)])
+        return state, self._slopes(*self._apart(points, residual[len(x) :].reshape(*points.shape[:3], -1), state))
 
-    def step(self, state: Starts, held: np.ndarray | None = None) -> tuple[Starts, np.ndarray]:
-        """One iteration of all starts, and by how much each objective fell. held: [S, D] bool, stay put."""
-        jacobian = self.jacobian(state)
+    def step(
+        self, state: Starts, held: np.ndarray | None = None, jacobian: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
+        """One iteration of all starts, and by how much each objective fell.
+
+        held: [S, D] bool, stay put.  jacobian: [S, M, D] where it is known.
+        """
+        jacobian = self.jacobian(state) if jacobian is None else jacobian
         before = state.objective
         self.iterations += 1
-        state = self.candidate_steps(state, jacobian, held)
+        state, jacobian = self.candidate_steps(state, jacobian, held)
+        self._known = state.x, jacobian
         curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one deviation wide, the others given; a start that stood still looks from elsewhere.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
         widths = np.clip(widths, self._config.smallest_step, self._config.step)
         return replace(state, widths=widths), fall(before, state.objective)
 
-    def candidate_steps(self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None) -> Starts:
-        """Batches of trials with one Jacobian [S, M, D] for as long as they pay."""
-        for _ in range(self._config.chords):
-            last, trials = state, self.trials(state, jacobian, held)
+    def candidate_steps(
+        self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
+        """Batches of trials from a Jacobian [S, M, D], for as long as they pay; and the slopes where they end.
+
+        Of each start another batch pays while the last one lowered its objective by as much, for its replays, as the
+        first one did for its own and those of the differences.
+        """
+        replays = self._config.trials, self._config.trials + 2 * len(self.space)
+        going, first, jacobian = np.arange(len(state.x)), np.zeros(len(state.x)), jacobian.copy()
+        for batch in range(self._config.chords):
+            last = state.rows(going)
+            trials = self.trials(last, jacobian[going], None if held is None else held[going])
             residual = self.replay(trials.reshape(-1, trials.shape[-1])).reshape(*trials.shape[:2], -1)
-            state = self.taken(state, trials, residual)
-            if not self.paid(last, state):
+            now = self.taken(last, trials, residual)
+            state, fell = state.with_rows(going, now), fall(last.objective, now.objective)
+            first = first if batch else fell
+            for k in np.flatnonzero(fell > 0):  # where a start stands still, differences are better than any trial
+                points, seen = np.vstack([last.x[k], trials[k]]), np.vstack([last.residual[k], residual[k]])
+                steps, changes = points - now.x[k], seen - now.residual[k]
+                wide = np.max(np.abs(steps), axis=1) >= self._config.smallest_step  # solver noise hides in shorter ones
+                jacobian[going[k]] = secant_slopes(
+                    jacobian[going[k]], self.prior, steps[wide], changes[wide], self._config.secant_ridge
+                )
+            going = going[(fell > 0) & (fell * replays[1] >= first[going] * replays[0])]
+            if not len(going):
                 break
-        return state
+        return state, jacobian
 
     def jacobian(self, state: Starts) -> np.ndarray:
         """[S, M, D] differences of every start in one batch; one-sided where a bound is in the way."""
         return self._slopes(*self.differences(*self._around(state.x, state.widths), state))
+
+    def slopes(self, state: Starts) -> np.ndarray:
+        """[M, D] slopes of one start: those of the last iteration where it ended there, else differences."""
+        starts, jacobians = self._known
+        at = np.flatnonzero(np.all(starts == state.x, axis=1))
+        return jacobians[at[0]] if len(at) else self.jacobian(state)[0]
 
     def _around(self, x: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """[S, D, D] a width up and down of starts [S, D] along each axis, within bounds."""

@@ -51,6 +51,8 @@ class RefineConfig(LevenbergMarquardtConfig):
     give_up: iterations like the last.
     pruning_ratio: after iteration i only starts within pruning_ratio[i] times the best objective go on (the last
       number holds from there on).
+    same_basin: of two starts whose replays differ by less than this share of what the better one leaves beyond noise,
+      only that one goes on: they would end at the same values.
     misfit_threshold: hypotheses are tried where the residuals' mean square stays above this.
     hold_iterations: iterations for which the values of a hypothesis are held while all else settles.
     followed: hypotheses that go on once all else has settled a little, the best ones.
@@ -69,12 +71,13 @@ class RefineConfig(LevenbergMarquardtConfig):
 
     iterations: int = 30
     tolerance: float = 0.5
-    excess_tolerance: float = 2e-3
+    excess_tolerance: float = 5e-3
     patience: int = 1
     coarse_tolerance: float = 5e-3
     target_objective: float = np.inf
-    give_up: float = 30.0
+    give_up: float = 5.0
     pruning_ratio: tuple[float, ...] = (100.0, 20.0, 3.0, 1.3, 1.0)
+    same_basin: float = 0.1
     misfit_threshold: float = 1.1
     hold_iterations: int = 2
     followed: int = 2
@@ -85,7 +88,7 @@ class RefineConfig(LevenbergMarquardtConfig):
     basin_hop_longest: float = 1.0
     basin_hop_tolerance: float = 2.0
     basin_hop_excess_tolerance: float = 4e-3
-    basin_hop_misfit: float = 2.0
+    basin_hop_misfit: float = 1.5
     reset_distance: float = 1.0
     reset_deviation: float = 0.05
 
@@ -104,6 +107,7 @@ class RefineConfig(LevenbergMarquardtConfig):
             **dict.fromkeys(("give_up", "basin_hop_sigma", "basin_hop_longest"), partial(arguments.number, above=0)),
             target_objective=partial(arguments.number, infinite=True),
             pruning_ratio=several(partial(arguments.number, least=1)),
+            same_basin=partial(arguments.number, least=0),
             misfit_threshold=partial(arguments.number, least=0),
             basin_hop_misfit=partial(arguments.number, above=0, infinite=True),
             hold_iterations=partial(whole, least=0),
@@ -180,22 +184,25 @@ def refine(
     """
     config = config or RefineConfig()
     rough = _Descent(residuals if first is None else first, space, config, progress)
-    begun = rough.start(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
+    begun, slopes = rough.start_with_slopes(rough.inside(space.to_search(space.check(np.atleast_2d(starts)))))
     ended, alive = begun.objective, np.isfinite(begun.objective)
     if not alive.any():
         raise NotReplayed("none of the starts could be replayed; widen the bounds or start nearer to the truth")
-    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance)
+    state, ended[alive] = rough.descend(begun.rows(alive), config.coarse_tolerance, slopes[alive])
     if hypotheses and np.mean(state.residual**2) > config.misfit_threshold:
-        state, _ = rough.descend(rough.explore(state, hypotheses), config.coarse_tolerance)
-    problem = rough
+        found = rough.explore(state, hypotheses)
+        if found is not state:
+            state, _ = rough.descend(found, config.coarse_tolerance)
+    problem, slopes = rough, None
     if first is not None:
         problem = _Descent(residuals, space, config, progress, rough)
-        state = problem.start(state.x)
+        state, slopes = problem.start_with_slopes(state.x)
         if not np.isfinite(state.objective[0]):
             raise NotReplayed(
                 "the best start on the first recording could not be replayed on all; start nearer to the truth"
             )
-    state, _ = problem.descend(state)
+    if problem is not rough or not rough.stands_still:
+        state, _ = problem.descend(state, jacobian=slopes)
     hops = 0 if problem.misses(state) else config.basin_hops
     if hops:
         state = problem.back(state)
@@ -206,7 +213,7 @@ def refine(
         best=space.from_search(state.x[0]),
         objective=float(state.objective[0]),
         residual=state.residual[0],
-        jacobian=problem.wide_jacobian(state, problem.jacobian(state)[0] if slopes is None else slopes),
+        jacobian=problem.wide_jacobian(state, problem.slopes(state) if slopes is None else slopes),
         prior=problem.prior,
         starts=ended,
         evaluations=problem.evaluations,
@@ -276,36 +283,49 @@ class _Descent(DampedProblem):
     ) -> None:
         super().__init__(residuals, space, config, before)
         self.config, self.progress = config, progress
-        self.given_up = False
+        self.given_up, self.stands_still = False, False
 
     def excess(self, state: Starts) -> np.ndarray:
         """[S] by how much the objectives are above half a unit for each residual, which noise alone leaves."""
         return np.maximum(state.objective - 0.5 * state.residual.shape[1], 0.0)
 
-    def descend(self, state: Starts, rough: float = 0.0) -> tuple[Starts, np.ndarray]:
+    def descend(
+        self, state: Starts, rough: float = 0.0, jacobian: np.ndarray | None = None
+    ) -> tuple[Starts, np.ndarray]:
         """Iterate until the best start stands still; that start, and the objective [S] each one ended at.
 
-        rough: a share of the objective that is not worth an iteration either.
+        rough: a share of the objective that is not worth an iteration either.  jacobian: [S, M, D] at `state`, where it
+        is known.  `stands_still` then says whether an iteration without `rough` would pay either.
         """
         ended, alive, self.given_up = state.objective.copy(), np.arange(len(state.x)), False
-        keep, idle = self.config.pruning_ratio, 0
+        keep, idle, still = self.config.pruning_ratio, 0, 0
         for number in range(self.config.iterations - self.iterations):
-            state, gain = self.step(state)
+            state, gain = self.step(state, jacobian=None if number else jacobian)
             ended[alive] = state.objective
             leader = int(np.argmin(state.objective))
             self._report(state.objective[leader], state.residual.shape[1])
-            paid = gain[leader] > max(self.least(state), rough * state.objective[leader])
-            idle = 0 if paid else idle + 1
+            least = self.least(state)
+            idle = 0 if gain[leader] > max(least, rough * state.objective[leader]) else idle + 1
+            still = 0 if gain[leader] > least else still + 1
+            # One that found nothing at all may yet with slopes over another width.
+            self.stands_still = still >= self.config.patience and bool(gain[leader] > 0)
             if idle == (1 if rough else self.config.patience):
                 break
             self.given_up = bool(
                 self.config.give_up * gain[leader] < state.objective[leader] - self.config.target_objective
             )
             if self.given_up:
+                self.stands_still = bool(gain[leader] > 0)
                 break
             good = state.objective <= keep[min(number, len(keep) - 1)] * state.objective[leader]
+            good &= self.apart(state, state.rows([leader])) | (np.arange(len(state.x)) == leader)
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), ended
+
+    def apart(self, state: Starts, other: Starts) -> np.ndarray:
+        """[S] bool, whether starts replay otherwise than another one [1], which is no worse than they are."""
+        between = 0.5 * np.sum((state.residual - other.residual) ** 2, axis=1)
+        return between > max(self.config.tolerance, self.config.same_basin * float(self.excess(other)[0]))
 
     def back(self, state: Starts) -> Starts:
         """Leave a basin that the data hardly chose: put back to its initial mean what strayed, and follow that.
@@ -336,7 +356,7 @@ class _Descent(DampedProblem):
 
     def strayed(self, state: Starts) -> list[str]:
         """Parameters of interest far from their initial means that the data do not tell sharply."""
-        slopes = self.jacobian(state)[0]
+        slopes = self.slopes(state)
         deviation = np.sqrt(np.diag(np.linalg.inv(curvature(slopes, self.prior))))
         far, open_ = np.abs(state.x[0]) > self.config.reset_distance, deviation > self.config.reset_deviation
         which = ~self.space.nuisance & far & open_
@@ -350,7 +370,7 @@ class _Descent(DampedProblem):
         """
         settled, slopes = hops == 0, None
         for number in range(hops):
-            slopes = self.jacobian(state)[0]
+            slopes = self.slopes(state)
             hopped = self.hop(state, slopes, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]
             least = max(self.config.basin_hop_tolerance, excess)
@@ -394,7 +414,8 @@ class _Descent(DampedProblem):
     def explore(self, state: Starts, hypotheses: Hypotheses) -> Starts:
         """Follow each hypothesis from a converged start: hold its values while all else settles, then free them.
 
-        After one iteration only the best of them go on.  Returns the better of what they found and `state`, one start.
+        After each iteration only the best of them go on, and of these only those in another basin than `state`, one
+        start.  Returns the better of what they found and `state`.
         """
         x = np.repeat(state.x, len(hypotheses), axis=0)
         held = np.zeros(x.shape, bool)
@@ -403,14 +424,20 @@ class _Descent(DampedProblem):
                 column = self.space.index(name)
                 x[row, column] = self.space[name].to_search(value)
                 held[row, column] = True
-        branches = self.start(self.inside(x))
+        branches, slopes = self.start_with_slopes(self.inside(x))
         alive = np.isfinite(branches.objective)
         if not alive.any():
             return state
-        branches, held = branches.rows(alive), held[alive]
+        branches, held, slopes = branches.rows(alive), held[alive], slopes[alive]
         for iteration in range(self.config.hold_iterations + 1):
-            branches, _ = self.step(branches, held if iteration < self.config.hold_iterations else None)
+            still = held if iteration < self.config.hold_iterations else None
+            branches, _ = self.step(branches, still, None if iteration else slopes)
             ahead = np.argsort(branches.objective)[: self.config.followed]
+            if iteration < self.config.hold_iterations:  # what is back in the basin that it left has nothing to find
+                other = (branches.objective < state.objective[0]) | self.apart(branches, state)
+                ahead = ahead[other[ahead]]
+            if not len(ahead):
+                return state
             branches, held = branches.rows(ahead), held[ahead]
         found = branches.rows([int(np.argmin(branches.objective))])
         best = found if found.objective[0] < state.objective[0] else state
