@@ -33,16 +33,14 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, publish  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
-from droid_jax.discrepancy.candidates import (  # noqa: E402
-    ScoreDirection,
-    ScoreTest,
-    directions_of,
-    observable_effects,
-)
+from droid_jax.discrepancy.candidates import ScoreDirection, ScoreTest, directions_of, observable_effects  # noqa: E402
 from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import discretisation_error, intervals, with_finer_step  # noqa: E402
-from droid_jax.discrepancy.log_case import base_model, case_of  # noqa: E402
-from droid_jax.discrepancy.search import search_effects, tested, with_step_differences  # noqa: E402
+from droid_jax.discrepancy.cross_validation import case_score_test  # noqa: E402
+from droid_jax.discrepancy.fitting import base_model  # noqa: E402
+from droid_jax.discrepancy.log_case import case_of  # noqa: E402
+from droid_jax.discrepancy.posterior import intervals  # noqa: E402
+from droid_jax.discrepancy.search import search_effects  # noqa: E402
+from droid_jax.discrepancy.step_error import discretisation_error, with_finer_step, with_step_differences  # noqa: E402
 from droid_jax.door.space import torque_offsets  # noqa: E402
 from droid_jax.model.effect_interface import Effect  # noqa: E402
 from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
@@ -271,7 +269,7 @@ def made(bench: Bench, plan: Plan, seed: int, arguments: Arguments) -> dict[str,
         model = base_model(case)
         result["fitted"] = time.monotonic() - began
         case = with_step_differences(case, model, with_finer_step(case.train, case.base, log))
-        screen = tested(case, model, directions_of(candidates(case.effects)))
+        screen = case_score_test(case, model, directions_of(candidates(case.effects)))
         result |= {
             "p": screen.p,
             "discrepancy": model.discrepancy,

@@ -33,8 +33,9 @@ from droid_jax.cost.lone_log import LoneLog
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.discrepancy.case import Case, only_comparison
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
-from droid_jax.discrepancy.fitting import deviations, intervals
-from droid_jax.discrepancy.log_case import base_model, make_log, single_case
+from droid_jax.discrepancy.fitting import base_model
+from droid_jax.discrepancy.log_case import make_log, single_case
+from droid_jax.discrepancy.posterior import deviations, intervals
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Verdict

@@ -32,8 +32,9 @@ from benchmarks.common import CODE, origin, stem  # noqa: E402
 from benchmarks.sharing import claimed  # noqa: E402
 from droid_jax.discrepancy.candidates import directions_of, score_test  # noqa: E402
 from droid_jax.discrepancy.config import SelectionConfig  # noqa: E402
-from droid_jax.discrepancy.fitting import base_fit, discretisation_error  # noqa: E402
+from droid_jax.discrepancy.fitting import base_fit  # noqa: E402
 from droid_jax.discrepancy.search import search_effects  # noqa: E402
+from droid_jax.discrepancy.step_error import discretisation_error  # noqa: E402
 from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from experiments.blind.cases import Plan  # noqa: E402

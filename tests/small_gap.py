@@ -1,6 +1,7 @@
-"""A small search for a missing effect, for the tests of its command and of what it writes.
+"""A small search for a missing effect, for tests of the search, its command and its files.
 
-experiments/bench.xml (an arm of two links and a driven door), short motions, and a hidden preload of the hinge.
+The scene is experiments/bench.xml, an arm of two links and a driven door.  Motions are short.  A preload of the hinge
+is hidden in the synthetic robot.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from droid_jax.discrepancy.candidate_fits import Problem
 from droid_jax.discrepancy.candidates import directions_of
 from droid_jax.discrepancy.case import Case, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit
-from droid_jax.discrepancy.search import Problem, search_effects
+from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import sign_flips, t_values
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.identify.multistart import RefineConfig
@@ -62,14 +64,14 @@ def write_parameters(folder: Path) -> Path:
 
 
 def small_scene() -> tuple[Scene, Space]:
-    """As the command line makes it."""
+    """The scene and the parameters, as the command line makes them."""
     scene = load_scene(SCENE, object_joint="door")
     with tempfile.TemporaryDirectory() as folder:
         return scene, load_parameters(write_parameters(Path(folder)), scene)
 
 
 def demonstration(name: str) -> Recording:
-    """ "train" and "validation" open and close the door at different speeds; so does "test", less far."""
+    """A motion that opens and closes the door; the three roles differ in speed and angle."""
     t = np.arange(0.0, SECONDS, 0.002)
     period, reach, pace = {"train": (1.5, 0.4, 2.0), "validation": (3.0, 0.35, 1.5), "test": (2.5, 0.3, 1.0)}[name]
     arm = [0.5 * np.sin(pace * t), 0.6 * np.sin(1.4 * pace * t)]
@@ -81,7 +83,7 @@ def demonstration(name: str) -> Recording:
 
 @functools.cache
 def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: float = 0.0) -> Recording:
-    """A recording of the synthetic robot."""
+    """A recording of the synthetic robot with hidden effects [N m]."""
     scene, space = small_scene()
     seed = 1 + ("train", "validation", "test").index(name)
     config = SyntheticRobotConfig(repeats=repeats, timestep=0.00025)
@@ -90,7 +92,7 @@ def record(name: str, repeats: int = 8, preload: float = PRELOAD, friction: floa
 
 
 def quiet(stage: str, value: object) -> None:
-    """A progress function that does nothing."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +107,13 @@ class Small:
 
     @property
     def own(self) -> FinalModel:
-        """The search's own model, of the first motion alone."""
+        """The final model without a final refit."""
         return FinalModel(self.verdict.model, (self.case.train,))
 
 
 @functools.cache
 def small() -> Small:
-    """The search of this session."""
+    """The search, made once for all tests."""
     recordings = {name: record(name) for name in ("train", "validation")}
     scene, space = small_scene()
     case = make_case(scene, space, library(scene, EFFECTS), **recordings, config=QUICK)
@@ -120,7 +122,7 @@ def small() -> Small:
 
 
 def problem_of(found: Small, deadline: float | None = None, progress: Progress = quiet) -> Problem:
-    """The problem that every step of the search receives."""
+    """The constants of the search, for single steps."""
     before = found.case.validation.discrepancy_at(found.base.values)
     asked = directions_of(candidates(found.case.effects))
     return Problem(found.case, found.base, before, FLOOR, asked, deadline, progress)
@@ -129,7 +131,7 @@ def problem_of(found: Small, deadline: float | None = None, progress: Progress =
 def largest_t(scores: np.ndarray) -> tuple[np.ndarray, float]:
     """[K] t of each of K directions with scores [K, N], and the p-value of the largest |t| among them.
 
-    Computed by the textbook formula, to be compared with the tests of the search.
+    This is the textbook test, to which the tests of the search are compared.
     """
     t = t_values(scores, sign_flips(scores.shape[1]))
     largest = np.max(np.abs(t), axis=1)

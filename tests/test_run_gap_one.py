@@ -120,7 +120,7 @@ def test_a_second_log_is_another_one(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_log_that_is_too_short_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(command(tmp_path, [LOG.window(0.0, 4.5)], "--effects", *ASKED)) == 2
     said = capsys.readouterr().err
-    assert said.startswith("error: ") and "4 are needed to tell an effect from noise" in said
+    assert said.startswith("error: ") and "4 are needed to distinguish an effect from noise" in said
 
 
 # ----- one log

@@ -72,8 +72,8 @@ def searched(
     Returns:
         The case, its verdict, the final model, and the seconds of each stage.
     """
-    from droid_jax.discrepancy.fitting import with_finer_step
     from droid_jax.discrepancy.missing import amended, search
+    from droid_jax.discrepancy.step_error import with_finer_step
     from droid_jax.report.progress import scalars, stages
 
     names = _stages(split, start is not None)

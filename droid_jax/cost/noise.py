@@ -29,8 +29,8 @@ class NoiseConfig:
     cutoff: Hz, of the low pass for data and simulation; real Panda residuals double between 8 and 20 Hz.
     rate: Hz, of the coarse clock of the smoothed channels; above twice the cutoff (Nyquist).
     longest_lag: s, the autocovariance is tapered to zero there.  With more lags, ten repeats give p-values that are too
-      small under the null hypothesis (tests/discrepancy/test_null_calibration.py): each lag has nine degrees of
-      freedom, and the weights become correlated with the mean.
+      small under the null hypothesis (tests/discrepancy/test_score_test.py): each lag has nine degrees of freedom, and
+      the weights become correlated with the mean.
     shrinkage: share by which an autocovariance is shrunk towards white noise of the same variance.
     least_window: share of the low pass's window that must be measured; the measured part is renormalised, and its noise
       with it.

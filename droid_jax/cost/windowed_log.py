@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from droid_jax.cost.channels import check_channels
-from droid_jax.cost.cost import Cost, check_friction_rows, check_read, followed
+from droid_jax.cost.cost import check_friction_rows, check_read, followed
 from droid_jax.cost.log_piece import STRETCH_SECONDS, TRACES, Piece, as_full_motion, in_windows, replayed, shared_steps
 from droid_jax.cost.noise import Noise
 from droid_jax.cost.observation import Measured, ShortFilter, least_noise
@@ -65,9 +65,11 @@ class Whitener:
 
 
 @dataclass(frozen=True, eq=False)
-class WindowedLog(Cost):
-    """The cost of pooled logs.
+class WindowedLog:
+    """The cost of pooled logs: called like a `Cost`, without what a `Cost` can do with other repeats or comparisons.
 
+    scene, space: what is simulated, and the meaning of the vectors [D].  comparisons: one, of all logs.  drives: one
+    for each recording.
     pieces: repeats of recordings.  order: [K] number of each instant of the log among those of all pieces.
     unit: [K] number of the window (or stretch) of each instant, in the log's order.
     fitted: number of units before the test data.  whole: why full motions are replayed; empty for windows.
@@ -78,6 +80,10 @@ class WindowedLog(Cost):
     too_short: names of recordings that are shorter than a window.
     """
 
+    scene: Scene
+    space: Space
+    comparisons: tuple[Comparison, ...]
+    drives: tuple[Drive, ...]
     pieces: tuple[Piece, ...]
     order: np.ndarray
     unit: np.ndarray
@@ -89,6 +95,10 @@ class WindowedLog(Cost):
     whitener: tuple[Whitener, ...] | None = None
     spreads: tuple[np.ndarray | None, ...] = field(default=())
     too_short: tuple[str, ...] = ()
+
+    def __call__(self, values: Any) -> np.ndarray:
+        """[P, D] -> [P] cost; never NaN."""
+        return self.distances(values)[:, 0]
 
     def simulated(self, values: Any) -> np.ndarray:
         """Return the compared channels [P, K, C] at values [P, D], through the filter of their data, in their units.
@@ -297,7 +307,7 @@ def windowed_log(
     order, unit, fitted = _order(pieces, fitted_share)
     comparison = _comparison([r for r in recordings if r.name not in short], pieces, order, config)
     return WindowedLog(
-        scene, space, (comparison,), tuple(drives), (), (), (), (), (), (),
+        scene, space, (comparison,), tuple(drives),
         tuple(pieces), order, unit, fitted, why, STRETCH_SECONDS if why else windows.length,
         np.ones(len(order), bool),
         lambda of, over, step: windowed_log(of, over, recordings, config, windows, (), fitted_share, step, whole=whole),

@@ -1,7 +1,19 @@
 """Where simulation and measurement still disagree after the fit, and which physical effect explains it.
 
-In the order in which a search uses them: `config` (all thresholds), `case` and `log_case` (the recordings of a
-search, with repeats or as logs), `statistics` (what a residual says), `candidates` (what could be missing), `fitting`
-(a model with effects in it), `maps` (where it disagrees), `selection` (which effects pass), `verdict` (the
-answer), `search` (from a base fit to a verdict), `results` (files), `missing` (the whole search as one call).
+Modules, each imports only from those before it:
+
+* `config`: all thresholds.
+* `statistics`: the discrepancy U and its tests.
+* `case`: the recordings of a search, the base parameters and the effects.
+* `candidates`: the score test and the effects that it proposes.
+* `fitting`: base parameters and effects fitted together.
+* `step_error`: the error of the simulation's time step.
+* `posterior`: the uncertainty of a fit.
+* `log_noise`, `log_case`: logs in blocks of time, and their noise.
+* `maps`: where simulation and measurement disagree.
+* `selection`: validation tests and the choice of a model.
+* `verdict`: the answer.
+* `candidate_fits`, `cross_validation`, `search`: the steps from a base fit to a verdict.
+* `results`: the files of a search.
+* `missing`: the whole search as one call.
 """

@@ -1,8 +1,9 @@
-"""Is anything missing, and what looks like it: the score test of every candidate, and what each could explain.
+"""The score test: whether anything is missing, and how much of the residual each candidate would explain.
 
-A candidate is simulated once with a small coefficient.  The whitened difference, less its projection on the base
-parameters' columns (their priors included), is its sensitivity; the product of sensitivity and residual, repeat by
-repeat, its score.  Source of the projection: Plumlee, Bayesian calibration of inexact computer models, JASA 2017.
+A candidate is simulated once with a small coefficient.  Its sensitivity is the whitened difference of the simulation,
+less the projection on the columns of the base parameters, priors included.  Its score is the product of sensitivity and
+residual, one for each repeat.  Source of the projection: Plumlee, Bayesian calibration of inexact computer models, JASA
+2017.
 """
 
 from __future__ import annotations
@@ -28,23 +29,22 @@ from droid_jax.recordings.recording import Recording
 if TYPE_CHECKING:
     from droid_jax.discrepancy.fitting import FittedModel
 
-ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # how model fields begin that inverse dynamics does not read
-SAMPLES = 16  # of a made-up motion
-SMALL = 0.3  # prior deviations of a coefficient: large against solver noise, small enough to be linear
+ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # beginnings of model fields that inverse dynamics does not read
+SAMPLES = 16  # of a random motion, on which the effect of a sensor model is tried
 
 
 def observable_effects(
     scene: Scene, recordings: Iterable[Recording], scale: float = 1.0, channels: Iterable[str] = ("torque",)
 ) -> tuple[Effect, ...]:
-    """The library's effects that could show in the compared channels of these recordings.
+    """The library's effects that can change the compared channels of these recordings.
 
-    In a recording without commands these are all but the ones that act on commands only.
+    Effects that act on commands alone are left out for recordings without commands.
 
     Args:
-        scene: which has the effects' joints and bodies.
+        scene: with the effects' joints and bodies.
         recordings: to be searched.
         scale: of the effects' forces and torques, see `library`.
-        channels: names of those compared.
+        channels: names of the compared channels.
     """
     commanded = all(r.command.size for r in recordings)
     asked = (e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
@@ -52,27 +52,29 @@ def observable_effects(
 
 
 def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
-    """Whether an effect could change a compared channel: one of sensors alone must do so itself, in a made-up motion.
+    """Whether an effect can change a compared channel.
 
-    A torque sensor's offset does not show in positions.
+    An effect that moves the robot can change all of them.  A sensor model is tried on a random motion: a torque offset
+    does not show in positions.
     """
     moves = effect.command or effect.servo or effect.force or effect.frictionloss
     if moves or effect.observe is None or any(p.writes for p in effect.parameters):
         return True
     rng = np.random.default_rng(0)
     torque, position, velocity = rng.normal(size=(3, SAMPLES, len(scene.joints)))
-    made_up = Rollout(
+    motion = Rollout(
         np.linspace(0.0, 1.0, SAMPLES), torque, position, velocity, rng.normal(size=SAMPLES),
         np.zeros((SAMPLES, 0), bool), np.array(True),
     )  # fmt: skip
-    seen = effect.observe({p.name: jnp.float32(p.mean + p.std) for p in effect.parameters}, made_up)
-    return any(not np.array_equal(getattr(seen, name), getattr(made_up, name)) for name in channels)
+    observed = effect.observe({p.name: jnp.float32(p.mean + p.std) for p in effect.parameters}, motion)
+    return any(not np.array_equal(getattr(observed, name), getattr(motion, name)) for name in channels)
 
 
 def acts_on_commands_only(effect: Effect) -> bool:
-    """Whether an effect is one of commands, servos or constraints alone, which a prescribed motion does not have.
+    """Whether an effect acts through commands, servos or constraints alone, which a prescribed motion does not have.
 
-    Also one without laws of its own whose parameters write nothing but fields of these (`servo_gain`, `soft_friction`).
+    This includes effects without functions whose parameters write only model fields of these (`servo_gain`,
+    `soft_friction`).
     """
     if effect.profile or effect.command or effect.servo:
         return True
@@ -97,15 +99,16 @@ def directions_of(candidates: Sequence[Candidate]) -> tuple[ScoreDirection, ...]
 
 @dataclass(frozen=True, eq=False)
 class ScoreTest:
-    """What the score test of a model found.
+    """Result of the score test of a model.
 
     directions: K of them.
-    raw: [K, M] what a unit of each coefficient adds; sensitivities: [K, M] the same, projected.
+    raw: [K, M] change of the simulation per unit of each coefficient, in one repeat's noise.
+    sensitivities: [K, M] the same after projection.
     t: [K] statistic.
-    explained: [K] share of the squared residual that the best coefficient would take away, linearly.
-    size: [K] that coefficient.
-    p: of the largest |t|.
-    failed: candidates that made the replay blow up; their sensitivities are zero.
+    explained: [K] share of the squared residual that the best coefficient would explain, linearly.
+    size: [K] that coefficient's distance from neutral.
+    p: p-value of the largest |t|.
+    failed: candidates whose replay blew up; their sensitivities are zero.
     """
 
     directions: tuple[ScoreDirection, ...]
@@ -118,12 +121,12 @@ class ScoreTest:
     failed: Keys = ()
 
     def ranking(self) -> list[int]:
-        """Directions by what they explain, the best first."""
+        """Indices of the directions by the share that they explain, the largest first."""
         return np.argsort(-self.explained).tolist()
 
 
 def rows_of(found: ScoreTest, parts: Sequence[Candidate]) -> list[int]:
-    """The directions of some candidates, in the shapes that they have."""
+    """Indices of the directions of some candidates with their shape parameters."""
     keys = {part.shaped_key for part in parts}
     return [k for k, d in enumerate(found.directions) if d.candidate.shaped_key in keys]
 
@@ -134,31 +137,37 @@ def sensitivities(
     directions: Sequence[ScoreDirection],
     at: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """[K, M] what each coefficient adds to the simulation, per unit of it, in units of one repeat's noise.
+    """Change of the simulation per unit of each coefficient, by one-sided differences from neutral in one batch.
 
-    values: [D] the fitted model.  at: [K] how large each coefficient is made, from neutral on; None: small.  One batch
-    for all.  NaN where the replay blew up.
+    Args:
+        residual_set: of the recording.
+        values: [D] of the fitted model.
+        directions: K of them.
+        at: [K] distance of each coefficient from neutral; None: `SelectionConfig.sensitivity_step` deviations.
+
+    Returns:
+        [K, M] in one repeat's noise.  A row is NaN if its replay blew up.
     """
-    space = residual_set.cost.space
+    space, share = residual_set.cost.space, residual_set.config.sensitivity_step
     rows, sizes = [values], []
     for number, direction in enumerate(directions):
         row = values.copy()
         for name, value in direction.candidate.shape_parameters.items():
             row[space.index(name)] = value
         p = space[direction.coefficient]
-        room = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
-        small = math.copysign(min(SMALL * p.std, 0.5 * abs(room)), room)
-        size = small if at is None else at[number]
+        span = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
+        step = math.copysign(min(share * p.std, 0.5 * abs(span)), span)
+        size = step if at is None else at[number]
         row[space.index(direction.coefficient)] = p.mean + size
         rows.append(row)
         sizes.append(size)
     simulated = -residual_set.common(np.stack(rows))
-    found = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
-    return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.nan)
+    slopes = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
+    return np.where(np.isfinite(slopes).all(axis=1, keepdims=True), slopes, np.nan)
 
 
 def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Columns [K, M] without what base columns [M, D] with prior deviations [D] would absorb of them."""
+    """Columns [K, M] less their ridge regression on base columns [M, D] with prior deviations [D]."""
     normal = base.T @ base + np.diag(prior**-2)
     return columns - np.linalg.solve(normal, base.T @ columns.T).T @ base.T
 
@@ -166,12 +175,12 @@ def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndar
 def score_test(
     residual_set: ResidualSet, model: FittedModel, directions: Sequence[ScoreDirection], seed: int = 0
 ) -> ScoreTest:
-    """Score directions against a model's residuals on the recording it was fitted to.
+    """The score test of directions against a model's residuals on the recording it was fitted to.
 
-    A base parameter at a bound absorbs nothing more: sensitivities keep what it would have taken.
+    A base parameter at a bound absorbs nothing, so sensitivities are not projected on its column.
 
-    What the simulation's own time step does to the residuals, where that was measured, is taken off first: it is the
-    same in every repeat or block, and no flip would tell it from an effect.
+    The error of the time step, if computed, is subtracted from the residuals first.  It is the same in every repeat or
+    block, so sign flips cannot distinguish it from an effect.
     """
     root, free = residual_set.repeats**0.5, model.refined.free
     base, prior = model.refined.jacobian[:, free] / root, model.refined.prior[free] * root * residual_set.prior_slack
@@ -195,32 +204,32 @@ def scored(
     projected: np.ndarray,
     largest: Callable[[np.ndarray], tuple[np.ndarray, float]],
 ) -> ScoreTest:
-    """Score projected sensitivities against residuals.
+    """The score test of projected sensitivities against residuals.
 
     Args:
         residuals: [N, M] of the model.
         directions: K of them.
         raw: [K, M] their sensitivities before projection.
-        projected: [K, M] after it.
+        projected: [K, M] their sensitivities after projection.
         largest: scores [K, N] -> statistic [K] and the p-value of the largest (see `Resampling.largest_score`).
     """
     scores = projected @ residuals.T  # [K, N]
     t, p = largest(scores)
     size = scores.mean(axis=1) / np.maximum(np.einsum("km,km->k", projected, projected), 1e-30)
-    shared = residuals.mean(axis=0)
-    explained = size * scores.mean(axis=1) / max(float(shared @ shared), 1e-30)
+    common = residuals.mean(axis=0)
+    explained = size * scores.mean(axis=1) / max(float(common @ common), 1e-30)
     return ScoreTest(tuple(directions), raw, projected, t, explained, size, p)
 
 
 @dataclass(frozen=True)
 class Trend:
-    """What changes most steadily from repeat to repeat: a gear that warms up, a sensor that drifts.
+    """The strongest trend over the repeats, e.g. of a gear that warms up or a sensor that drifts.
 
-    Repeats are taken for draws of the same thing, so what changes between them counts as noise and is in no U.
+    Repeats are treated as measurements of one motion.  Changes between them count as noise and are not in U.
 
-    key, coefficient: whose sensitivity it follows.
-    per_repeat: by how much the coefficient changes from one repeat to the next, in its unit.
-    p: of a trend as strong in any candidate where the order of the repeats says nothing.
+    key, coefficient: the candidate and the coefficient whose sensitivity follows the trend.
+    per_repeat: change of the coefficient from one repeat to the next, in its unit.
+    p: p-value of the largest trend among all candidates, by permutations of the order.
     """
 
     key: EffectKey
@@ -230,7 +239,7 @@ class Trend:
 
 
 def trend(found: ScoreTest, residuals: np.ndarray, seed: int = 0) -> Trend | None:
-    """The strongest trend of residuals [N, M] over their order; None for fewer than three repeats."""
+    """The strongest trend of residuals [N, M] over the order of the repeats; None for fewer than three repeats."""
     if len(residuals) < 3 or not found.directions:
         return None
     size = np.maximum(np.linalg.norm(found.sensitivities, axis=1), 1e-30)
@@ -242,7 +251,12 @@ def trend(found: ScoreTest, residuals: np.ndarray, seed: int = 0) -> Trend | Non
 
 @dataclass(frozen=True)
 class Proposal:
-    """One or several candidates together, their coefficients, and the share of the squared residual they would take."""
+    """Candidates to add to a model.
+
+    parts: one or several candidates.
+    sizes: coefficient -> value.
+    explained: share of the squared residual that they would explain, linearly.
+    """
 
     parts: tuple[Candidate, ...]
     sizes: Mapping[str, float]
@@ -250,11 +264,11 @@ class Proposal:
 
     @property
     def keys(self) -> Keys:
-        """Of the candidates."""
+        """Keys of the candidates."""
         return keys_of(self.parts)
 
     def start(self, space: Space, values: np.ndarray) -> np.ndarray:
-        """`values` [D] with the shape parameters and coefficients proposed."""
+        """`values` [D] with the proposed shape parameters and coefficients."""
         out = values.copy()
         for name, value in {**{k: v for c in self.parts for k, v in c.shape_parameters.items()}, **self.sizes}.items():
             out[space.index(name)] = value
@@ -264,7 +278,7 @@ class Proposal:
 def proposals(
     found: ScoreTest, residuals: np.ndarray, space: Space, number: int = 1, among: Container[EffectKey] | None = None
 ) -> list[Proposal]:
-    """Every candidate (number = 1), or every pair of candidates (2), best shapes only, the best first.
+    """Every candidate, or every pair of candidates, with its best shape parameters, the best first.
 
     Coefficients stay inside their bounds: a friction that would have to be negative explains nothing.
 
@@ -272,19 +286,19 @@ def proposals(
         found: the score test.
         residuals: [N, M] of the model that was tested.
         space: of all parameters.
-        number: of candidates together.
-        among: the candidates to take, None for all.
+        number: 1 for candidates, 2 for pairs.
+        among: keys of the candidates to propose, None for all.
     """
-    mean = residuals.mean(axis=0)
-    whole = max(float(mean @ mean), 1e-30)
-    scores, gram = found.sensitivities @ mean, found.sensitivities @ found.sensitivities.T
+    common = residuals.mean(axis=0)
+    squared = max(float(common @ common), 1e-30)
+    scores, gram = found.sensitivities @ common, found.sensitivities @ found.sensitivities.T
     groups: dict[EffectKey, list[int]] = {}
     for k, direction in enumerate(found.directions):
         if among is None or direction.candidate.key in among:
             groups.setdefault(direction.candidate.shaped_key, []).append(k)
     best: dict[Keys, Proposal] = {}
     for rows in _combinations(list(groups.values()), number, found):
-        proposal = _proposal(found, rows, scores[rows], gram[np.ix_(rows, rows)], whole, space)
+        proposal = _proposal(found, rows, scores[rows], gram[np.ix_(rows, rows)], squared, space)
         known = best.get(proposal.keys)
         if known is None or proposal.explained > known.explained:
             best[proposal.keys] = proposal
@@ -296,9 +310,9 @@ def _combinations(groups: Sequence[list[int]], number: int, found: ScoreTest) ->
         return list(groups)
 
     def together(a: Candidate, b: Candidate) -> bool:
-        """Neither holds the other's coefficients; and an effect has one shape at all its locations."""
-        apart = not {*a.coefficients} & {*b.coefficients}
-        return apart and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
+        """Whether two candidates fit into one model: no shared coefficient, one shape for an effect's locations."""
+        disjoint = not {*a.coefficients} & {*b.coefficients}
+        return disjoint and (a.effect != b.effect or a.shape_parameters == b.shape_parameters)
 
     of = [found.directions[rows[0]].candidate for rows in groups]
     both = ((i, k) for i in range(len(of)) for k in range(i + 1, len(of)) if together(of[i], of[k]))
@@ -306,8 +320,9 @@ def _combinations(groups: Sequence[list[int]], number: int, found: ScoreTest) ->
 
 
 def _proposal(
-    found: ScoreTest, rows: Sequence[int], scores: np.ndarray, gram: np.ndarray, whole: float, space: Space
+    found: ScoreTest, rows: Sequence[int], scores: np.ndarray, gram: np.ndarray, squared: float, space: Space
 ) -> Proposal:
+    """The candidates of `rows` with their best coefficients inside the bounds; squared: the squared residual."""
     names = [found.directions[k].coefficient for k in rows]
     low = np.array([space[n].low - space[n].mean for n in names])
     high = np.array([space[n].high - space[n].mean for n in names])
@@ -317,14 +332,14 @@ def _proposal(
     else:
         factor = np.linalg.cholesky(ridge)
         size = lsq_linear(factor.T, np.linalg.solve(factor, scores), bounds=(low, high)).x
-    explained = float(2 * size @ scores - size @ gram @ size) / whole
+    explained = float(2 * size @ scores - size @ gram @ size) / squared
     sizes = {n: float(space[n].mean + s) for n, s in zip(names, size, strict=True)}
     parts = {found.directions[k].candidate.shaped_key: found.directions[k].candidate for k in rows}
     return Proposal(tuple(parts.values()), sizes, explained)
 
 
 def collinear(found: ScoreTest, keys: Container[EffectKey], cosine: float) -> set[EffectKey]:
-    """The candidates whose sensitivity is nearly one of these candidates', by absolute cosine."""
+    """Candidates with a sensitivity whose absolute cosine with one of `keys` is above `cosine`."""
     rows = np.array([d.candidate.key in keys for d in found.directions])
     unit = found.sensitivities / np.maximum(np.linalg.norm(found.sensitivities, axis=1, keepdims=True), 1e-30)
     near = np.max(np.abs(unit @ unit[rows].T), axis=1) > cosine

@@ -1,10 +1,11 @@
-"""What a search works on: recordings against a model in units of one repeat's noise, base parameters and effects."""
+"""The data of a search: residuals of each recording in units of one repeat's noise, base parameters and effects."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from droid_jax.cost.cost import Cost, make_cost
 from droid_jax.cost.observation import Measured
 from droid_jax.cost.replay_cache import cached
 from droid_jax.cost.residuals import Comparison
+from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.config import DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling
 from droid_jax.identify.identifiability import IdentifiabilityConfig
@@ -25,25 +27,27 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS
 
-AT_REST = 2  # steps of Gauss and Newton for a recording's own nuisances where joints are at rest along its motion
+AnyCost: TypeAlias = Cost | WindowedLog  # of one recording, or of pooled logs
+NUISANCE_ITERATIONS = 2  # Gauss-Newton steps for per-recording nuisances where joints come to rest during the motion
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualSet:
-    """A recording's cost, what is resampled and tested of it, and its own nuisances.
+    """The residuals of one recording: its cost, the rows that are flipped and resampled, its nuisances.
 
     cost: of this recording alone.
-    whitened: [P, D] -> [P, M], distances: [P, D] -> [P, 1]: the cost's own, or ones that remember their replays.
+    whitened: [P, D] -> [P, M], and distances: [P, D] -> [P, 1]; the cost's methods, or versions that cache replays.
     resampling: whole repeats, or blocks of time.
     column, time: [M] compared column and instant [s] of each residual.
     config, identifiability: thresholds of the search.
-    equivalence_factor, prior_slack: those of the config that go with the resampling.
-    step_difference: [M] what a quarter of the time step changes, in one repeat's noise; None: not measured.
-    nuisances: names of nuisances that this recording has for itself; nuisance_columns: [M, len(nuisances)] what one
-    prior deviation of each adds to the common residual.  See `with_nuisances`.
+    equivalence_factor, prior_slack: the thresholds of the config for this kind of resampling.
+    step_difference: [M] residuals at a quarter of the time step minus residuals, in one repeat's noise; None: not
+        computed.
+    nuisances: names of per-recording nuisances, which are fitted to this recording (`with_nuisances`).
+    nuisance_columns: [M, len(nuisances)] change of the common residual by one prior deviation of each.
     """
 
-    cost: Cost
+    cost: AnyCost
     whitened: Callable[[np.ndarray], np.ndarray]
     distances: Callable[[np.ndarray], np.ndarray]
     resampling: Resampling
@@ -59,37 +63,41 @@ class ResidualSet:
 
     @property
     def comparison(self) -> Comparison:
-        """Of the recording."""
+        """The comparison of the recording."""
         return only_comparison(self.cost)
 
     @property
     def repeats(self) -> int:
-        """Of the recording."""
+        """Number of repeats of the recording."""
         return self.comparison.repeats
 
     def instants_of(self, channel: Measured) -> np.ndarray:
-        """[K] bool of a channel's coarse clock, those that count."""
+        """[K] bool, instants of a channel's coarse clock that belong to this set."""
         names = [c.name for c in self.comparison.channels]
         before = self.comparison.channels[: names.index(channel.name)]
         return self.resampling.counted[self.column == sum(len(c.columns) for c in before)]
 
     def common(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, M] mean of the repeats minus simulation, the recording's own nuisances at their best.
+        """[P, D] -> [P, M] mean of the repeats minus simulation, with fitted per-recording nuisances.
 
-        NaN throughout where a replay blew up.
+        A row is NaN throughout if its replay blew up.
         """
         return self._nuisances_fitted(values)[1]
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        """[D] -> [N, M] of every repeat or block."""
+        """[D] -> [N, M] residuals of every repeat or block."""
         return self.resampling.residuals(self.common(values)[0])
 
     def at_best_nuisances(self, values: np.ndarray) -> np.ndarray:
-        """[P, D] -> [P, D] with the recording's own nuisances where `common` has them."""
+        """[P, D] -> [P, D] with the fitted values of the per-recording nuisances."""
         return self._nuisances_fitted(values)[0]
 
     def discrepancy_at(self, values: np.ndarray) -> float:
-        """U of the model at `values` [D]; NotReplayed where its replay blows up."""
+        """U of the model at `values` [D].
+
+        Raises:
+            NotReplayed: the replay blows up.
+        """
         common = self.common(values)[0]
         if not np.isfinite(common).all():
             raise NotReplayed(
@@ -99,9 +107,9 @@ class ResidualSet:
         return self.resampling.discrepancy(self.resampling.residuals(common))
 
     def with_nuisances(self, names: Sequence[str]) -> ResidualSet:
-        """The same, with nuisances `names` that are not the fitted recording's but fitted to this one.
+        """The same set, with nuisances `names` fitted to this recording instead of taken from the training recording.
 
-        They must enter the residual linearly (torque offsets).  Each is fitted with its own prior.
+        They must enter the residual linearly (torque offsets).  Each is fitted with its prior.
         """
         if not names:
             return self
@@ -111,10 +119,10 @@ class ResidualSet:
         return replace(self, nuisances=tuple(names), nuisance_columns=(common[1:] - common[0]).T)
 
     def _nuisances_fitted(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows [P, D] with own nuisances at their best, and their residuals [P, M]."""
+        """Rows [P, D] with fitted per-recording nuisances, and their common residuals [P, M]."""
         rows = np.array(np.atleast_2d(values), dtype=np.float64)
-        space, own = self.cost.space, [self.cost.space.index(name) for name in self.nuisances]
-        rows[:, own] = space.mean[own]
+        space, nuisances = self.cost.space, [self.cost.space.index(name) for name in self.nuisances]
+        rows[:, nuisances] = space.mean[nuisances]
         common = self._common(rows)
         if self.nuisance_columns is None:
             return rows, common
@@ -122,10 +130,10 @@ class ResidualSet:
         columns = self.nuisance_columns * moves[:, None]
         normal = columns.T @ columns + np.eye(len(self.nuisances)) / self.repeats
         best = np.zeros((len(rows), len(self.nuisances)))
-        # Where a joint is at rest its friction takes up an offset as far as it can: there it is replayed again.
-        for _ in range(1 if moves.all() else AT_REST):
+        # At rest, friction absorbs an offset up to its limit.  The residual is not linear there: it is computed again.
+        for _ in range(1 if moves.all() else NUISANCE_ITERATIONS):
             best -= np.linalg.solve(normal, (common @ columns + best / self.repeats).T).T
-            rows[:, own] = space.mean[own] + space.std[own] * best
+            rows[:, nuisances] = space.mean[nuisances] + space.std[nuisances] * best
             common = common + best @ self.nuisance_columns.T if moves.all() else self._common(rows)
         return rows, common
 
@@ -133,7 +141,7 @@ class ResidualSet:
         return -self.whitened(rows).astype(np.float64) / np.sqrt(self.repeats)
 
     def _moves(self) -> np.ndarray:
-        """[M] bool, residuals at which their joint moves; all of them where motions are not prescribed."""
+        """[M] bool, residuals whose joint moves; all of them unless the motion is prescribed."""
         return np.concatenate([channel.moves.T.ravel() for channel in self.comparison.channels])
 
 
@@ -141,23 +149,29 @@ def residual_set(cost: Cost, config: DiscrepancyConfig | None = None) -> Residua
     """The residual set of a cost over one recording with repeats.
 
     Raises:
-        ValueError: several recordings at once, or a single repeat: whole repeats are what the tests flip.
+        ValueError: several recordings, or a single repeat.  The tests flip the signs of whole repeats.
     """
     comparison, config = only_comparison(cost), config or DiscrepancyConfig()
     if comparison.repeats < 2:
         raise ValueError(f"recording {comparison.name!r} has one repeat; a discrepancy needs repeats, or blocks")
     rows = Repeats(comparison.deviations() / np.sqrt(comparison.repeats))
     selection = config.selection
-    return _of(cost, rows, config, selection.equivalence_factor, selection.prior_slack)
+    return _residual_set_of(cost, rows, config, selection.equivalence_factor, selection.prior_slack)
 
 
 def block_residual_set(
-    cost: Cost, block: np.ndarray, config: DiscrepancyConfig | None = None, least: int = FEWEST_REPEATS
+    cost: AnyCost, block: np.ndarray, config: DiscrepancyConfig | None = None, least: int = FEWEST_REPEATS
 ) -> ResidualSet:
-    """The residual set of a cost over one recording of one repeat; block: [K] of each instant of the coarse clock.
+    """The residual set, in blocks of time, of a cost over one recording of one repeat.
 
-    least: blocks that there must be.  Raises:
-        ValueError: repeats, which need no blocks, or fewer blocks than flips can use.
+    Args:
+        cost: over the recording.
+        block: [K] block of each instant of the coarse clock.
+        config: thresholds of the search.
+        least: least number of blocks.
+
+    Raises:
+        ValueError: several repeats, or fewer blocks than `least`.
     """
     config, comparison = config or DiscrepancyConfig(), only_comparison(cost)
     if comparison.repeats > 1:
@@ -166,10 +180,12 @@ def block_residual_set(
         raise ValueError(f"recording {comparison.name!r}: {block.max() + 1} blocks, at least {least} are needed")
     column, _ = residual_locations(comparison)
     rows, blocks = Blocks(np.tile(block, int(column.max()) + 1)), config.blocks
-    return _of(cost, rows, config, blocks.equivalence_factor, blocks.prior_slack)
+    return _residual_set_of(cost, rows, config, blocks.equivalence_factor, blocks.prior_slack)
 
 
-def _of(cost: Cost, rows: Resampling, config: DiscrepancyConfig, factor: float, slack: float) -> ResidualSet:
+def _residual_set_of(
+    cost: AnyCost, rows: Resampling, config: DiscrepancyConfig, factor: float, slack: float
+) -> ResidualSet:
     return ResidualSet(
         cost,
         cost.whitened,
@@ -183,7 +199,7 @@ def _of(cost: Cost, rows: Resampling, config: DiscrepancyConfig, factor: float, 
     )
 
 
-def only_comparison(cost: Cost) -> Comparison:
+def only_comparison(cost: AnyCost) -> Comparison:
     """The comparison of a cost over one recording; ValueError for several."""
     if len(cost.comparisons) != 1:
         raise ValueError(f"a residual set is of one recording, got {len(cost.comparisons)}")
@@ -201,17 +217,23 @@ def residual_locations(comparison: Comparison) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(columns), np.concatenate(times)
 
 
-FAR = 1e4  # prior deviations that no sensor is off
+UNBOUNDED_DEVIATIONS = 1e4  # prior deviations: bounds of a nuisance that is solved for, beyond any real offset
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What every step needs.  train: parameters are fitted to it; validation: effects are selected on it; test: opened
-    once, at the end.  base: the base parameters; effects: those that are tested.
-    start: [D] from where the base fit of a log begins, None: the prior's mean.  limits: what cannot be concluded from
-    these recordings, beside `Split.limits`.
-    both: the blocks of training and validation together, where they are of the same logs: what tells whether anything
-    is missing at all; None where they are other repeats or motions.
+    """The recordings of a search, the base parameters and the effects that are tested.
+
+    train: residual set that parameters are fitted to.
+    validation: residual set that effects are selected on.
+    test: residual set that is used once, in the verdict; None: no test data.
+    base: the base parameters.
+    effects: tested effects.
+    config: settings of the search.
+    start: [D] where the base fit of a log begins; None: the prior's mean.
+    limits: conclusions that these recordings do not allow, in words, beside those of `Split.limits`.
+    both: training and validation blocks together, if they are of the same logs.  Whether anything is missing is tested
+        on all of them.  None if training and validation have different repeats or motions.
     """
 
     train: ResidualSet
@@ -226,36 +248,42 @@ class Case:
 
     @property
     def full_space(self) -> Space:
-        """Base parameters and all effects'."""
+        """Base parameters and the parameters of all tested effects."""
         return self.train.cost.space
 
     @property
     def residual_sets(self) -> dict[str, ResidualSet]:
-        """Role -> residual set: "train", "validation" and, where there is one, "test"."""
+        """Role -> residual set: "train", "validation" and, if there are test data, "test"."""
         roles = {"train": self.train, "validation": self.validation, "test": self.test}
         return {role: e for role, e in roles.items() if e is not None}
 
     def against(self, recordings: Mapping[str, Recording]) -> Case:
-        """The same compiled replays and other repeats, by role.
+        """The case of other repeats, by role, with the same compiled replays.
 
-        Raises ValueError unless they have the same commands on the same clock (see `Cost.against`).
+        Raises:
+            ValueError: a case of windows, other commands or another clock (see `Cost.against`).
         """
-        costs = [e.cost.against([recordings[role]]) for role, e in self.residual_sets.items()]
+        costs = list[Cost]()
+        for role, residual_set in self.residual_sets.items():
+            if isinstance(residual_set.cost, WindowedLog):
+                raise ValueError("a case of windows has no repeats to replace: make another case (`log_case.case_of`)")
+            costs.append(residual_set.cost.against([recordings[role]]))
         return _of_costs(costs, self.base, self.effects, self.config)
 
     def with_replay_cache(self, folder: Path) -> Case:
-        """The same, remembering its replays below `folder`, which belongs to this case alone.
+        """The same case, which caches the results of its replays in `folder`.  No other case may use the folder.
 
-        The search is the same computation every time, so one that was killed is simply run again: what it asks of a
-        replay the second time is read.
+        A search is deterministic.  After a stop the same search is run again and reads the replays made before.
         """
 
-        def remembering(role: str, known: ResidualSet) -> ResidualSet:
-            both = {name: cached(getattr(known, name), folder / role, name) for name in ("whitened", "distances")}
-            return replace(known, **both)
+        def caching(role: str, residual_set: ResidualSet) -> ResidualSet:
+            functions = ("whitened", "distances")
+            return replace(
+                residual_set, **{name: cached(getattr(residual_set, name), folder / role, name) for name in functions}
+            )
 
         sets = self.residual_sets | ({} if self.both is None else {"both": self.both})
-        return replace(self, **{role: remembering(role, e) for role, e in sets.items()})
+        return replace(self, **{role: caching(role, residual_set) for role, residual_set in sets.items()})
 
     @property
     def minimum_sizes(self) -> dict[str, float]:
@@ -264,7 +292,7 @@ class Case:
 
     @property
     def natural_bounds(self) -> frozenset[str]:
-        """Coefficients whose bounds are where nature ends, not where the search does."""
+        """Coefficients whose bounds are physical limits and not limits of the search."""
         return frozenset(name for e in self.effects for name in e.natural_bounds)
 
 
@@ -277,19 +305,19 @@ def make_case(
     test: Recording | None = None,
     config: DiscrepancyConfig | None = None,
 ) -> Case:
-    """Of recordings with repeats: one compiled replay for each, all effects in it, at neutral.
+    """The case of recordings with repeats.  Each has one compiled replay with all effects in it, at neutral.
 
     Args:
         scene: the robot.
-        base: all that is fitted without any effect.
+        base: parameters that are fitted without any effect.
         effects: to test.
-        train: parameters are fitted to it.
-        validation: moves differently; effects are selected on it.
-        test: judged on once, when the effects are selected; `minimum_closed` may then turn names into hints.
-        config: of the search.
+        train: recording that parameters are fitted to.
+        validation: recording of another motion, on which effects are selected.
+        test: recording on which the selected effects are judged once; `minimum_closed` may then turn names into hints.
+        config: settings of the search.
 
     Raises:
-        ValueError: too few repeats: with fewer than eight, no flip of signs could ever be significant.
+        ValueError: fewer than eight repeats; sign flips of fewer cannot reach the significance level.
     """
     config = instance(DiscrepancyConfig() if config is None else config, "config", DiscrepancyConfig)
     instance(base, "base", Space)
@@ -297,7 +325,8 @@ def make_case(
     few = [r.name for r in recordings if r.repeats < FEWEST_REPEATS]
     if few:
         raise ValueError(
-            f"recordings {', '.join(few)}: at least {FEWEST_REPEATS} repeats are needed to tell an effect from noise"
+            f"recordings {', '.join(few)}: at least {FEWEST_REPEATS} repeats are needed to distinguish an effect from "
+            "noise"
         )
     config = comparing(scene, recordings, config)
     scene = ready(scene)
@@ -316,7 +345,8 @@ def make_case(
 def comparing(scene: Scene, recordings: Sequence[Recording], config: DiscrepancyConfig) -> DiscrepancyConfig:
     """The config with the channels that are compared (`channels.chosen_channels`), each of weight one if chosen here.
 
-    Raises ValueError where a recording lacks one of them, or its replay does not produce it.
+    Raises:
+        ValueError: a recording lacks one of them, or its replay does not produce it.
     """
     chosen = chosen_channels(scene, recordings, config.channels, config.compare)
     if chosen:
@@ -333,30 +363,30 @@ def _of_costs(costs: Sequence[Cost], base: Space, effects: tuple[Effect, ...], c
 
 
 def per_recording_nuisances(base: Space) -> list[str]:
-    """Nuisances that every recording has for itself: what a sensor shows at rest changes from day to day."""
+    """Names of per-recording nuisances: a torque sensor's offset changes from day to day."""
     return [p.name for p in base.of_role(Role.TORQUE_OFFSET) if p.nuisance]
 
 
-def unbounded(whole: Space, names: Sequence[str]) -> Space:
-    """The space of a recording whose own nuisances `names` are solved for, however far off they are."""
-    far = {n: FAR * whole[n].std for n in names}
+def unbounded(space: Space, names: Sequence[str]) -> Space:
+    """The space with practically no bounds on the nuisances `names`, which are solved for."""
+    distance = {n: UNBOUNDED_DEVIATIONS * space[n].std for n in names}
     return Space(
         tuple(
-            replace(p, low=p.mean - far[p.name], high=p.mean + far[p.name]) if p.name in far else p
-            for p in whole.parameters
+            replace(p, low=p.mean - distance[p.name], high=p.mean + distance[p.name]) if p.name in distance else p
+            for p in space.parameters
         )
     )
 
 
 def restrained(base: Space, bound: float, known: Collection[str] = ()) -> Space:
-    """The base with every nuisance kept within some prior deviations: what stands further off is an effect.
+    """The base parameters with every nuisance bounded to `bound` prior deviations from its mean.
 
-    known: those that a recording states, whose values may lie anywhere within their bounds.
+    known: names of parameters whose values a recording states; they keep their bounds.
     """
 
-    def kept(p: Parameter) -> Parameter:
+    def bounded(p: Parameter) -> Parameter:
         if not p.nuisance or p.name in known:
             return p
         return replace(p, low=max(p.low, p.mean - bound * p.std), high=min(p.high, p.mean + bound * p.std))
 
-    return Space(tuple(kept(p) for p in base.parameters))
+    return Space(tuple(bounded(p) for p in base.parameters))

@@ -1,42 +1,29 @@
-"""A case of logs: blocks of time in place of repeats.  And the case of any recordings.
+"""Cases of logs, in blocks of time instead of repeats, and the case of any recordings (`case_of`).
 
-Logs without commands are cut into blocks, commanded logs with few repeats into windows.  How long windows are is a
-setting; how many of them make a block depends on the noise.  Where a log is too short for eight blocks in each part,
-what is given up first is said (`Case.limits`), and what can be told is told.
+Logs without commands are cut into blocks, commanded logs with few repeats into windows.  The length of windows is a
+setting.  The number of windows in a block depends on the noise.  If a log is too short for eight blocks in each part,
+the search makes do with less, and `Case.limits` lists the consequences.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from droid_jax.cost.cost import check_known
 from droid_jax.cost.lone_log import LoneLog, lone_log
-from droid_jax.cost.noise import stated_deviation
 from droid_jax.cost.windowed_log import WindowedLog, windowed_log
-from droid_jax.discrepancy.candidates import Proposal, ScoreTest, directions_of, proposals, rows_of, score_test
-from droid_jax.discrepancy.case import (
-    Case,
-    ResidualSet,
-    block_residual_set,
-    comparing,
-    make_case,
-    per_recording_nuisances,
-    restrained,
-    unbounded,
-)
-from droid_jax.discrepancy.config import FEWER_TRIALS, DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, refit
-from droid_jax.discrepancy.statistics import OUTSIDE, block_length, fewest_blocks, in_turns, interleaved
+from droid_jax.discrepancy.case import Case, comparing, make_case, per_recording_nuisances, restrained, unbounded
+from droid_jax.discrepancy.config import FEWER_TRIALS, BlocksConfig, DiscrepancyConfig
+from droid_jax.discrepancy.fitting import refit
+from droid_jax.discrepancy.log_noise import Report, noise_of, with_blocks
+from droid_jax.discrepancy.statistics import OUTSIDE, fewest_blocks, in_turns, interleaved
 from droid_jax.identify.evaluation import evaluate_on, evaluation_json
-from droid_jax.identify.multistart import RefineProgress
-from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect
-from droid_jax.model.effects.candidate import candidates
 from droid_jax.model.effects.registry import beside, joined, ready
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -44,8 +31,7 @@ from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, pooled
 from droid_jax.simulate.windows import fully_servoed, why_no_windows
 
-Log: TypeAlias = LoneLog | WindowedLog
-Report: TypeAlias = Callable[[RefineProgress], None] | None
+PARTS = 2  # training and validation
 
 
 def make_log(
@@ -56,10 +42,18 @@ def make_log(
     config: DiscrepancyConfig | None = None,
     known: Sequence[Effect] = (),
 ) -> LoneLog:
-    """The cost of a recording of one repeat without commands, all effects in its replay, at neutral.
+    """The cost of a recording of one repeat without commands, with all effects in its replay, at neutral.
 
-    known: effects that the base has already; their parameters are in `base`.
-    Raises ValueError for repeats and for commands, see `lone_log`.
+    Args:
+        scene: the robot.
+        base: the base parameters.
+        effects: to test.
+        recording: the log.
+        config: settings of the search.
+        known: effects of the base model, whose parameters are in `base`.
+
+    Raises:
+        ValueError: several repeats, or commands (see `lone_log`).
     """
     config = config or DiscrepancyConfig()
     whole = joined(restrained(base, config.selection.nuisance_bound, recording.known), effects)
@@ -74,15 +68,23 @@ def single_case(
     config: DiscrepancyConfig | None = None,
     start: np.ndarray | None = None,
 ) -> Case:
-    """A case from one log, or from two of which the second is test data, with its own torque offsets.
+    """The case of one log, or of two logs of which the second is test data.
 
-    The last third of the log is test data, or a second log is.  What comes before is cut into blocks that train and
-    validate in turns.  In turns, because a log holds its motion once or twice: a base model fitted to one half of it
-    misses what only the other half moves, and that would look like an effect.  So the validation blocks tell an effect
-    from noise and not from another form of it; other motions are for what is test data.
+    The last third of the log is test data, unless a second log is.  The rest is cut into blocks that train and validate
+    in turns.  They alternate because a log holds a motion once or twice: a base model fitted to its first half does not
+    fit motions of the second half, and the error would look like an effect.  The validation blocks therefore
+    distinguish an effect from noise, but not from another form of it.  Test data of other motions do.
 
-    start: [D] where fits begin, fitted to this motion before; the prior's mean unless given.
-    Raises ValueError where the log is too short for its residual's correlation time: eight blocks in all are needed.
+    Args:
+        log: the cost of the log (`make_log`).
+        base: the base parameters.
+        effects: to test.
+        test: the cost of a second log.  Its torque offsets are fitted to it.
+        config: settings of the search.
+        start: [D] where fits begin; None: the prior's mean.
+
+    Raises:
+        ValueError: the log has fewer than eight blocks of its residual's correlation time.
     """
     config = config or DiscrepancyConfig()
     clock = log.clock
@@ -95,181 +97,24 @@ def single_case(
         with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), deviation, part, config, FEWEST_REPEATS // PARTS)
         for which, part in zip(("every other block", "the blocks between"), blocks, strict=True)
     )
-    own = [] if test is None else per_recording_nuisances(base)  # another day's; the rest of the same log has the same
+    nuisances = [] if test is None else per_recording_nuisances(base)  # the last third of a log has those of the log
     rest = log.part(f"{log.comparisons[0].name}, last third") if test is None else test
     judged = with_blocks(
-        replace(rest, space=unbounded(rest.space, own)) if own else rest,
+        replace(rest, space=unbounded(rest.space, nuisances)) if nuisances else rest,
         deviation[[log.columns.index(c) for c in rest.columns]],
         fewest_blocks(rest.clock, end if test is None else rest.clock[0]),
         config,
     )
-    if own:
-        judged = judged.with_nuisances(own)
+    if nuisances:
+        judged = judged.with_nuisances(nuisances)
     base = restrained(base, config.selection.nuisance_bound)
     both = with_blocks(log, deviation, in_turns(list(blocks)), config)
     few = train.resampling.units
-    limits = (f"Only {few} blocks train and as many validate: small effects stay hidden.",)
+    limits = (f"Only {few} blocks train and as many validate: small effects are not found.",)
     return Case(
         train, validation, judged, base, tuple(effects), config, both=both,
         limits=limits if few < FEWEST_REPEATS else (),
     )  # fmt: skip
-
-
-def base_model(case: Case, start: np.ndarray | None = None, progress: Report = None) -> FittedModel:
-    """The base parameters of a case in blocks fitted, from where the case says unless a start [D] is given.
-
-    Inverse dynamics is smooth in them, and windows nearly are, so one start and no search will do.
-    """
-    known = case.full_space.mean if case.start is None else case.start
-    start = known if start is None else start
-    return refit(case.train, case.base, (), start[None], case.config.refine, progress=progress)
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseEstimate:
-    """Noise of one log.
-
-    deviation: [C] to state.  block: s, length of the blocks.  values: [D] of the base fitted meanwhile.
-    """
-
-    deviation: np.ndarray
-    block: float
-    values: np.ndarray
-
-
-def noise_of(
-    log: Log,
-    base: Space,
-    effects: Sequence[Effect],
-    end: float,
-    config: DiscrepancyConfig,
-    start: np.ndarray | None,
-    progress: Report = None,
-) -> NoiseEstimate:
-    """What to state as the noise of a log, and how long its blocks are, from what lies before `end`.
-
-    One recording does not tell its noise.  What is stated, and sets the blocks' length, is the smallest residual that
-    an extended model leaves, the base and up to `max_effects` candidates chosen and fitted linearly, in columns where
-    that is less than a fifth of what the base leaves (in squares, `BlocksConfig.noise_share`); else what the base
-    leaves.  Of a commanded log a candidate that takes much of a column is fitted in full too: in a replay a strong
-    effect is not linear.
-    The fifth is there because the best of many candidates takes noise too, and what it leaves is correlated for too
-    short a time.  It is asked of each column: a clock at another rate shows in positions, and a torque sensor's noise
-    stays whatever explains them.
-    So with something missing that the library explains in part only, noise is stated too large and blocks are long:
-    intervals are wide and less is named.  A discrepancy in these units is no absolute size, but ratios of
-    discrepancies are free of the unit.
-    """
-    inside = log.clock < end
-    block = fewest_blocks(log.clock[inside], log.clock[0])
-    block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
-    if start is None:  # what the prior's mean leaves is no noise
-        start = _rough_fit(log, base, effects, log.space.mean, block, config, progress)[1].values
-    case, model, deviation = _rough_fit(log, base, effects, start, block, config, progress)
-    found = score_test(case.train, model, directions_of(candidates(effects)), config.seed)
-    common = model.residuals.mean(axis=0)
-
-    def by_column(residual: np.ndarray) -> np.ndarray:
-        """[K, C] in physical units of [M] in units of the stated deviation, of what is inside."""
-        return (residual.reshape(len(deviation), -1).T * deviation)[inside]
-
-    whole, rest = by_column(common), by_column(least_residual(found, common, log.space, config))
-    # Inverse dynamics is nearly linear in what an effect adds; a replay is not.
-    refitted = None
-    if isinstance(log, WindowedLog):
-        refitted = refitted_residual(case, model, found, len(deviation), progress)
-    if refitted is not None:
-        other = by_column(refitted)
-        rest = np.where(np.sum(other**2, axis=0) < np.sum(rest**2, axis=0), other, rest)
-    left = noise_left(whole, rest, config.blocks.noise_share)
-    rate = config.compare.noise.rate
-    stated = stated_deviation(left, log.moves[inside], rate)
-    # Each window begins at its own measured state, so that what they leave of slow noise is short.
-    lasting = rest if isinstance(log, WindowedLog) else left
-    return NoiseEstimate(stated, block_length(lasting, config.blocks, rate), model.values)
-
-
-def refitted_residual(
-    case: Case, model: FittedModel, found: ScoreTest, columns: int, progress: Report = None
-) -> np.ndarray | None:
-    """[M] what the candidate that takes most of any one column leaves once it is fitted in full; None where none takes
-    `BlocksConfig.refit_share` of a column.
-
-    Of many columns an effect at one joint explains few, and so a small share of all.
-    """
-    space, common = case.full_space, model.residuals.mean(axis=0)
-    whole = np.sum(common.reshape(columns, -1) ** 2, axis=1)
-
-    def share(proposal: Proposal) -> float:
-        """Of the column in which it leaves least."""
-        rows = rows_of(found, proposal.parts)
-        sizes = [proposal.sizes[found.directions[k].coefficient] for k in rows]
-        left = common - sizes @ found.sensitivities[rows]
-        return float(np.min(np.sum(left.reshape(columns, -1) ** 2, axis=1) / np.maximum(whole, 1e-30)))
-
-    ranked = [(share(proposal), k, proposal) for k, proposal in enumerate(proposals(found, common[None], space))]
-    least, _, best = min(ranked)
-    if least > 1 - case.config.blocks.refit_share:
-        return None
-    try:
-        start = best.start(space, model.values)[None]
-        fitted = refit(case.train, case.base, best.parts, start, case.config.refit, progress=progress)
-    except NotReplayed:
-        return None
-    return fitted.residuals.mean(axis=0)
-
-
-def noise_left(whole: np.ndarray, least: np.ndarray, share: float) -> np.ndarray:
-    """[K, C] what counts as noise of each column: what the best candidates leave, where that is less than a share of
-    the base model's residual `whole` [K, C], in squares.
-    """
-    return np.where(np.sum(least**2, axis=0) < share * np.sum(whole**2, axis=0), least, whole)
-
-
-def _rough_fit(
-    log: Log,
-    base: Space,
-    effects: Sequence[Effect],
-    values: np.ndarray,
-    block: np.ndarray,
-    config: DiscrepancyConfig,
-    progress: Report,
-) -> tuple[Case, FittedModel, np.ndarray]:
-    """The base fitted with the noise [C] stated that `values` [D] leave."""
-    noise, inside = config.compare.noise, block >= 0
-    left = stated_deviation(log.residual(values)[inside], log.moves[inside], noise.rate)
-    deviation = np.maximum(left, log.least_noise())
-    rows = with_blocks(log, deviation, block, config)
-    case = Case(rows, rows, None, base, tuple(effects), config)
-    return case, base_model(case, values, progress), deviation
-
-
-def least_residual(found: ScoreTest, left: np.ndarray, space: Space, config: DiscrepancyConfig) -> np.ndarray:
-    """[M] what the best `max_effects` candidates leave of residuals `left` [M], one after the other, linearly.
-
-    One that takes less than an effect must is left out: it would take noise.
-    """
-    for _ in range(config.max_effects):
-        best = proposals(found, left[None], space)[0]
-        if best.explained < config.selection.least_gain:
-            break
-        taken, _ = np.linalg.qr(found.sensitivities[rows_of(found, best.parts)].T)
-        left = left - taken @ (taken.T @ left)
-        found = replace(found, sensitivities=found.sensitivities - (found.sensitivities @ taken) @ taken.T)
-    return left
-
-
-def with_blocks(
-    log: Log, deviation: np.ndarray, block: np.ndarray, config: DiscrepancyConfig, least: int = FEWEST_REPEATS
-) -> ResidualSet:
-    """Its instants in blocks [K], with noise of a deviation [C]; least: blocks that there must be."""
-    return block_residual_set(log.with_noise(deviation, block >= 0), block, config, least)
-
-
-PARTS = 2  # training and validation
-DRAWS = 31  # of the base's prior, among which starts are chosen; with its mean a CPU's block
-BEST = 1  # of them
-LEAST_TEST = 4  # units of a test part
 
 
 def case_of(
@@ -282,19 +127,29 @@ def case_of(
     start: np.ndarray | None = None,
     progress: Report = None,
 ) -> Case:
-    """Of recordings by role (see `preflight.search_inputs.assigned_roles`), logs where they are cut in time.
+    """The case of recordings by role.
 
-    start: [F] values of the base parameters out of an earlier fit, where those of commanded logs in blocks begin.
-    progress: called with each iteration of the first fits of commanded logs, which tell the noise.
-    Sensors' gains and encoders' offsets that the base has as parameters are not tested there.
-    Raises ValueError for what is wrong with them, does not fit the scene, or a channel that cannot be compared.
+    Sensor gains and encoder offsets that the base has as parameters are not tested as effects of the same joints.
+
+    Args:
+        split: how recordings are split into training, validation and test data.
+        scene: the robot.
+        base: the base parameters.
+        effects: to test.
+        roles: role -> recording (`preflight.search_inputs.assigned_roles`).
+        config: settings of the search.
+        start: [F] values of the base parameters from an earlier fit, where the fits of windows begin.
+        progress: called with each iteration of the fits that estimate the noise of windows.
+
+    Raises:
+        ValueError: invalid recordings, recordings of another scene, parameters stated in a recording (`known`) that the
+            base model does not have, or a channel that cannot be compared.
     """
     check_known(base, pooled(roles, "train"))
     for recording in roles.values():
-        names = {*recording.known, *(v for v in recording.known.values() if isinstance(v, str))}
-        if strange := sorted(names - {*base.names}):
+        if unknown := base.unknown_names(recording.known):
             raise ValueError(
-                f"recording {recording.name!r} states {', '.join(strange)}, which the base model of a search does not "
+                f"recording {recording.name!r} states {', '.join(unknown)}, which the base model of a search does not "
                 f"have; it has: {', '.join(base.names)}"
             )
     effects, config = beside(base, effects), comparing(scene, tuple(roles.values()), config)
@@ -319,25 +174,25 @@ def windowed_case(
     start: np.ndarray | None = None,
     progress: Report = None,
 ) -> Case:
-    """A case of pooled logs: their windows train and validate in turns, block by block.
+    """The case of pooled commanded logs, whose windows train and validate in turns, block by block.
 
-    The last third of every log is test data (of logs of one window each every third log), or other recordings are,
-    which have torque offsets of their own.
+    The last third of every log is test data, unless other recordings are.  (For logs of one window it is every third
+    log.)  The torque offsets of other test recordings are fitted to them.  Recordings shorter than a window are left
+    out (`Case.limits`).
 
     Args:
         scene: the robot.
-        base: all that is fitted without any effect.
+        base: the base parameters.
         effects: to test.
-        train: commanded recordings of the same channels, of one repeat or several.  Of long ones that would be replayed
-            whole a number of windows is (`WindowConfig.longest`).
-        test: others.
-        config: of the search.
+        train: commanded recordings of the same channels, of one repeat or several.  Long recordings that would be
+            replayed whole are sampled by windows (`WindowConfig.longest`).
+        test: recordings that are test data.
+        config: settings of the search.
         start: [F] values of the base parameters where its fit begins; None: the best of some draws.
-        progress: called with each iteration of the first fits, which tell the noise.
+        progress: called with each iteration of the fits that estimate the noise.
 
     Raises:
-        ValueError: recordings of different channels or joints, or so short that no two blocks are in each part. One
-            that is shorter than a window is left out (`Case.limits`).
+        ValueError: recordings of different channels or joints, or too short for two blocks in each part.
     """
     config = config or DiscrepancyConfig()
     config = replace(config, refine=replace(config.refine, basin_hops=0))  # windows are nearly smooth in parameters
@@ -351,32 +206,32 @@ def windowed_case(
         config = replace(
             config, **{name: replace(getattr(config, name), **FEWER_TRIALS) for name in ("refine", "refit", "polish")}
         )
-    unknown = list[str]()
+    over_time = list[str]()
     if not at_once and not any(why_no_windows(scene, recording) for recording in train):
-        unknown = [e.name for e in effects if e.over_time]
+        over_time = [e.name for e in effects if e.over_time]
         effects = [e for e in effects if not e.over_time]
-    left_out = (
-        f"Windows do not know when their recording began, so {' and '.join(unknown)} cannot be looked for in them "
-        "(--replay whole looks for all)."
+    not_tested = (
+        f"Windows do not hold the time since their recording began, so {' and '.join(over_time)} cannot be tested "
+        "(--replay whole tests all effects)."
     )
-    if unknown and not effects:
-        raise ValueError(left_out)
+    if over_time and not effects:
+        raise ValueError(not_tested)
     scene, whole = ready(scene), joined(base, effects)
     log = windowed_log(scene, whole, train, compare, windows, effects, share, whole=at_once)
-    log = replace(log, instants=log.unit < log.fitted)  # the rest is not replayed before its time
-    own = per_recording_nuisances(base) if test else []
+    log = replace(log, instants=log.unit < log.fitted)  # test data are not replayed yet
+    nuisances = per_recording_nuisances(base) if test else []
     judged = None
     if test:
-        judged = windowed_log(scene, unbounded(whole, own), test, compare, judging, effects, whole=at_once)
-    end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # widths are asked for later
+        judged = windowed_log(scene, unbounded(whole, nuisances), test, compare, judging, effects, whole=at_once)
+    end, rough = _end_of(log), replace(config, refine=replace(config.refine, spreads=0))  # no posterior is needed yet
     if start is None:
-        first = _first_values(log, base, effects, end, rough, progress)
+        first = _first_values(log, base, end, rough, progress)
     else:
         first = whole.embed(base, np.clip(start, base.low, base.high)[None])[0]
-    # With the spread of their first states known, what windows leave is correlated for as long as the noise is.
+    # Whitened with the spread of the initial states, residuals of windows have the correlation time of the noise.
     noise = noise_of(log.about(first), base, effects, end, rough, first, progress)
     log = log.about(noise.values)
-    plan = planned(log, noise.block, config.blocks.shortest, judged is None)
+    plan = planned(log, noise.block, config.blocks, judged is None)
     sets = [
         with_blocks(log.part(f"{log.comparisons[0].name}, {which}"), noise.deviation, block, config, 1)
         for which, block in zip(("every other block", "the blocks between", "last third"), plan.blocks, strict=False)
@@ -384,13 +239,13 @@ def windowed_case(
     if judged is not None:
         deviation = noise.deviation[[log.columns.index(c) for c in judged.columns]]
         judged = judged.about(noise.values)
-        everything = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
-        sets.append(with_blocks(judged, deviation, everything, config, 1).with_nuisances(own))
+        blocks = _in_groups(judged.unit, 0, int(judged.unit.max()) + 1, FEWEST_REPEATS)
+        sets.append(with_blocks(judged, deviation, blocks, config, 1).with_nuisances(nuisances))
     last = sets[2] if len(sets) > PARTS else None
     both = with_blocks(log, noise.deviation, in_turns(plan.blocks[:PARTS]), config, 1)
     limits = ([f"Motions were replayed whole: {log.whole}."] if log.whole and not at_once else []) + list(plan.limits)
-    if unknown:
-        limits.append(left_out)
+    if over_time:
+        limits.append(not_tested)
     if short := [*log.too_short, *(() if judged is None else judged.too_short)]:
         limits.append(f"Shorter than a window and left out: {', '.join(short)} (--replay whole takes them).")
     if sampled and not log.whole:
@@ -403,17 +258,22 @@ def windowed_case(
 
 
 def _seconds(recordings: Sequence[Recording]) -> float:
-    """s, of all their repeats."""
+    """Duration of all repeats of some recordings [s]."""
     return sum(recording.duration * recording.repeats for recording in recordings)
 
 
 def open_loop_errors(
     case: Case, roles: Mapping[str, Recording], before: np.ndarray, after: np.ndarray
 ) -> dict[str, Any]:
-    """Errors of whole replays of each recording, open loop, at two vectors [D]: what windows by themselves do not tell.
+    """Open-loop errors of each recording, replayed whole at two vectors, as plain data (`evaluation.evaluation_json`).
 
-    As plain data (`evaluation.evaluation_json`).  Effects that act in neither are left out, so that plain C can replay
-    what it has.
+    Windows alone do not show them.  Effects that are at neutral in both vectors are left out of the replays, so that
+    plain C can make them if it has the others.
+
+    Args:
+        case: of the recordings.
+        roles: role -> recording.
+        before, after: [D] of the base model and of the final model.
     """
     cost = case.train.cost
     whole = replace(case.config.compare, channels={name: 1.0 for name in case.config.compare.channels})
@@ -425,12 +285,12 @@ def open_loop_errors(
     replays = evaluate_on(
         cost.scene, space, list(roles.values()), before=before, after=after, effects=acting, engine="auto", config=whole
     )
-    found = evaluation_json(replays)
-    return {name: found[name] for name in ("errors", "mean_mae")}
+    evaluation = evaluation_json(replays)
+    return {name: evaluation[name] for name in ("errors", "mean_mae")}
 
 
 def _end_of(log: WindowedLog) -> float:
-    """s on the log's clock, before which lies what is fitted and validated."""
+    """End of the training and validation windows on the log's clock [s]."""
     clock, count = log.clock, int(np.sum(log.unit < log.fitted))
     return float(clock[count]) if count < len(clock) else float(clock[-1]) + 1e-6
 
@@ -438,50 +298,58 @@ def _end_of(log: WindowedLog) -> float:
 def _first_values(
     log: WindowedLog,
     base: Space,
-    effects: Sequence[Effect],
     end: float,
     config: DiscrepancyConfig,
     progress: Report = None,
 ) -> np.ndarray:
-    """[D] the base fitted from its mean and from the best of some draws of its prior."""
+    """[D] of the base model, fitted from the prior's mean and from the best of some draws of the prior."""
     whole, inside = log.space, log.clock < end
-    drawn = np.random.default_rng(config.seed).normal(size=(DRAWS, len(base)))
+    drawn = np.random.default_rng(config.seed).normal(size=(config.blocks.start_draws, len(base)))
     rows = whole.embed(base, np.concatenate([base.mean[None], base.from_search(drawn)]))
-    left = log.residual(whole.mean)[inside]
-    if not np.isfinite(left).all():
+    residual = log.residual(whole.mean)[inside]
+    if not np.isfinite(residual).all():
         raise ValueError(
             f"the simulation of {log.comparisons[0].name!r} blows up at the parameters' initial means: shorten the "
             "scene's time step, give light joints armature, or begin at other means"
         )
     block = fewest_blocks(log.clock[inside], log.clock[0])
     block = np.r_[block, np.full(len(log.clock) - len(block), OUTSIDE)]
-    rough = with_blocks(log, np.sqrt(np.mean(left**2, axis=0)), block, config, 1)
+    rough = with_blocks(log, np.sqrt(np.mean(residual**2, axis=0)), block, config, 1)
     cost = np.nan_to_num(np.sum(rough.whitened(rows) ** 2, axis=1), nan=np.inf)
-    starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[:BEST]]])
+    starts = np.concatenate([rows[:1], rows[1:][np.argsort(cost[1:])[: config.blocks.best_draws]]])
     return refit(rough, base, (), starts, config.refine, progress=progress).values
 
 
 @dataclass(frozen=True, eq=False)
 class BlockPlan:
-    """Blocks [K] of the training, the validation and perhaps the test part, and what could not be had."""
+    """Block numbers [K] of the training, validation and perhaps test part.
+
+    limits: consequences of a short log, in words.
+    """
 
     blocks: tuple[np.ndarray, ...]
     limits: tuple[str, ...]
 
 
-def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -> BlockPlan:
-    """How a log's units (windows, stretches) make blocks of `length` s or more, eight in each part at least.
+def planned(log: WindowedLog, length: float, config: BlocksConfig, with_test: bool) -> BlockPlan:
+    """The blocks of a log's units (windows, or stretches of whole motions), at least eight in each part.
 
-    Where it is too short, blocks are first made shorter, then there is no test part, then fewer than eight.
+    If the log is too short, the blocks are shortened first; then the test part is given up, then some of the blocks.
+
+    Args:
+        log: the log.
+        length: s, of a block.
+        config: with the least length of a shortened block.
+        with_test: whether the last units are test data.
 
     Raises:
-        ValueError: not even two blocks in each part.
+        ValueError: fewer than two blocks in each part.
     """
-    seconds, limits = log.unit_seconds, list[str]()
+    seconds, shortest, limits = log.unit_seconds, config.shortest, list[str]()
     fitted, total = log.fitted, int(log.unit.max()) + 1
     tested = with_test and total > fitted
     needed = PARTS * FEWEST_REPEATS * max(1, math.ceil(shortest / seconds - 1e-6))
-    if tested and fitted < needed <= total - LEAST_TEST:  # a smaller test part rather than none
+    if tested and fitted < needed <= total - config.least_test:  # a smaller test part rather than none
         fitted = needed
     each = _each(fitted, length, seconds)
     if each < FEWEST_REPEATS and _each(fitted, shortest, seconds) >= FEWEST_REPEATS:
@@ -515,12 +383,12 @@ def planned(log: WindowedLog, length: float, shortest: float, with_test: bool) -
 
 
 def _each(units: int, length: float, seconds: float) -> int:
-    """Blocks of each part."""
+    """Number of blocks in each part."""
     return units // max(1, math.ceil(length / seconds - 1e-6)) // PARTS
 
 
 def _in_groups(unit: np.ndarray, first: int, end: int, groups: int) -> np.ndarray:
-    """[K] group of each instant, of about equal numbers of units from `first` to `end`; at most as many as units."""
+    """[K] group of each instant, with about equal numbers of units from `first` to `end`; at most one a unit."""
     groups = min(groups, end - first)
     found = (unit - first) * groups // max(end - first, 1)
     return np.where((unit >= first) & (unit < end), found, OUTSIDE)

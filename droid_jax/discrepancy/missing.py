@@ -1,6 +1,6 @@
-"""The search for missing effects as one call, and what is added to its verdict: candidate experiments, the final refit.
+"""The search for missing effects as one call, and the amendments of its verdict: experiments and the final refit.
 
-The command `gap` makes the same search, goes on after a stop and leaves a folder and a page.
+The command `gap` makes the same search.  It also continues after a stop and writes a folder and a page.
 """
 
 from __future__ import annotations
@@ -17,22 +17,15 @@ import mujoco
 import numpy as np
 
 from droid_jax.arguments import instance, instances
-from droid_jax.cost.cost import Cost, make_cost
+from droid_jax.cost.cost import make_cost
 from droid_jax.discrepancy.candidates import observable_effects
-from droid_jax.discrepancy.case import Case, comparing
+from droid_jax.discrepancy.case import AnyCost, Case, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import (
-    FinalModel,
-    FittedModel,
-    base_fit,
-    discretisation_error,
-    final_refit,
-    final_refit_due,
-    with_finer_step,
-)
-from droid_jax.discrepancy.log_case import base_model, case_of
+from droid_jax.discrepancy.fitting import FinalModel, FittedModel, base_fit, base_model, final_refit, final_refit_due
+from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.results import extended
-from droid_jax.discrepancy.search import search_effects, with_step_differences
+from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.step_error import discretisation_error, with_finer_step, with_step_differences
 from droid_jax.discrepancy.verdict import Experiment, Verdict
 from droid_jax.errors import reason
 from droid_jax.files import NOT_MADE, TO_BE_MADE
@@ -53,7 +46,7 @@ from droid_jax.simulate.workspace_extrapolation import FURTHER, opened_further
 EXPERIMENTS, REFIT = "experiments", "final_refit"  # names of the amendments in gap.json
 MADE, NOT_NEEDED = "made", "not needed"
 IN_THE_AIR = "the same motion in the air, away from what the hand held"
-WEIGHT = 0.5  # kg
+WEIGHT = 0.5  # kg, of the known weight in a candidate experiment
 
 
 def find_missing_effects(
@@ -67,30 +60,30 @@ def find_missing_effects(
     progress: Progress | None = None,
     judge_on: Sequence[Recording] = (),
 ) -> tuple[Verdict, Extended]:
-    """Find the physical effect that a model lacks, and return the model with it (docs/discrepancy-search.md).
+    """Find the physical effects that a model lacks, and return the model with them (docs/discrepancy-search.md).
 
     Args:
         scene: the robot.
-        space: all that is fitted without any effect, nuisances among it: `found.full` of an identification.
-        recordings: train, validation and perhaps test, eight repeats or more of each; or one, sixteen repeats or more,
-            whose second half validates; or a log of one repeat without commands, alone or with another one as test
-            data; or any number of commanded logs with fewer repeats, whose windows train and validate in turns.
-        effects: to test; None for all of the library (`droid_jax.model.effects.registry`) that could show in
-            these recordings.
-        start: [D] physical values over `space`, `found.best`, where the base fit begins instead of with a search; a
-            log without repeats needs neither.
-        config: all thresholds and settings.
+        space: base parameters with nuisances, e.g. `found.full` of an identification.
+        recordings: for training, validation and optionally test, each with eight repeats or more.  Or one recording
+            with sixteen repeats or more, whose second half is for validation.  Or a log of one repeat without commands,
+            optionally with a second one as test data.  Or commanded logs with fewer repeats, whose windows are for
+            training and validation in turns.
+        effects: to test; None for all effects of the library (`droid_jax.model.effects.registry`) that can change the
+            compared channels.
+        start: [D] physical values over `space`, e.g. `found.best`, where the base fit begins; None: CMA-ES searches for
+            a start.  Logs without repeats need neither.
+        config: thresholds and settings.
         progress: called with a stage's name and its progress value.
-        judge_on: commanded logs that are test data, beside others of few repeats.
+        judge_on: commanded logs as test data, for `recordings` with few repeats.
 
     Returns:
-        The verdict, whose discrepancies are in squared noise units of one repeat, and the extended model.  Only another
-        motion distinguishes effects that act alike in this one (`Split.limits`).  With effects in it, the model is
-        fitted to both motions (`fitting.final_refit`); where that fails it is the search's own, of the first motion.
+        The verdict, whose discrepancies are in squared noise units of one repeat, and the extended model.  A model with
+        effects is fitted to both motions (`fitting.final_refit`); if that fit fails, it is that of the training motion.
+        Effects that act alike in these motions are distinguished by other motions alone (`Split.limits`).
 
     Raises:
-        ValueError: recordings in which a search could not end well, effects that are none, or that a recording without
-            commands cannot have.
+        ValueError: recordings that no search can use, or effects that they cannot show.
     """
     config = instance(DiscrepancyConfig() if config is None else config, "config", DiscrepancyConfig)
     check_space(instance(scene, "scene", Scene), instance(space, "space", Space))
@@ -101,7 +94,7 @@ def find_missing_effects(
     asked = observable_effects(scene, recordings, channels=compared) if given is None else tuple(map(checked, given))
     if not asked:
         raise ValueError("effects: there is none to test; None tests all of the library")
-    candidates(asked)  # refused before the base fit, and not after it
+    candidates(asked)  # raises for effects without a location, before the base fit
     start = None if start is None else space.check(start)
     case = case_of(split, scene, space, asked, roles, config, start)
     for limit in case.limits:
@@ -116,21 +109,22 @@ def find_missing_effects(
 def search(
     split: Split,
     case: Case,
-    fine: Cost | None,
+    fine: AnyCost | None,
     start: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> tuple[Case, Verdict]:
-    """The verdict on a case of recordings by role (see `case_of`), without its amendments (see `amended`).
-
-    The case is returned with what the time step does to its training recording, which is in the intervals.
+    """The verdict on a case (see `case_of`), without its amendments (see `amended`).
 
     Args:
-        split: how the recordings share the work.
-        case: with a replay cache (`Case.with_replay_cache`) the search goes on after a stop.
-        fine: what `with_finer_step` made of the training recording.
-        start: [F] values of the base parameters from which their fit begins, instead of a search; of logs in blocks the
-            case has it.
+        split: how recordings are split into training, validation and test data.
+        case: the case; with a replay cache (`Case.with_replay_cache`) a search continues after a stop.
+        fine: cost of the training recording from `with_finer_step`.
+        start: [F] values of the base parameters where their fit begins; None: CMA-ES searches for a start.  Not used
+            for logs in blocks, whose case holds a start.
         progress: called with a stage's name and its progress value.
+
+    Returns:
+        The case with the error of the time step (`with_step_differences`), which is in the intervals, and the verdict.
     """
     report = progress or (lambda stage, value: None)
     if split in (Split.BLOCKS, Split.WINDOWS):
@@ -147,10 +141,11 @@ def search(
 
 @dataclass(frozen=True, eq=False)
 class Amended:
-    """A verdict with what has been added to it so far.
+    """A verdict with its amendments so far.
 
-    final: the model to hand on, the search's own until the final refit is made.  states: amendment -> MADE,
-    NOT_NEEDED, TO_BE_MADE, or "not made: " and the reason.
+    verdict: the verdict.
+    final: the model to return; that of the search until the final refit is made.
+    states: amendment -> `MADE`, `NOT_NEEDED`, `TO_BE_MADE`, or "not made: " and the reason.
     """
 
     verdict: Verdict
@@ -161,12 +156,16 @@ class Amended:
 def amended(
     case: Case, verdict: Verdict, recording: Recording, progress: Progress = lambda stage, value: None
 ) -> Iterator[Amended]:
-    """The verdict unchanged, then again after each amendment; the last one is whole.
+    """Yield the verdict unchanged, and again after each amendment; the last one is complete.
 
-    Both amendments take minutes, and neither changes the answer.  So a caller writes the verdict first and each
-    addition when it is made; one that raises is left out, its state says why, and nothing else is lost.
+    Both amendments take minutes and neither changes the conclusion.  A caller can write the verdict first and each
+    amendment when it is made.  If an amendment raises, its state holds the reason and the verdict stays as before.
 
-    recording: what the case was fitted to.
+    Args:
+        case: the recordings.
+        verdict: of the search.
+        recording: the training recording.
+        progress: called with a stage's name and its progress value.
     """
     states = {
         EXPERIMENTS: TO_BE_MADE if verdict.indistinguishable_models and case.train.resampling.repeated else NOT_NEEDED,
@@ -186,7 +185,7 @@ def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended
     verdict = now.verdict
     try:
         experiments = separating_experiments(case, (verdict.model, *verdict.indistinguishable_models), recording)
-    except Exception as error:  # whatever it is: the verdict stands
+    except Exception as error:  # of any kind: the verdict does not depend on it
         return _state(now, EXPERIMENTS, f"{NOT_MADE}: {reason(error)}")
     return _state(replace(now, verdict=replace(verdict, experiments=experiments)), EXPERIMENTS, MADE)
 
@@ -194,8 +193,8 @@ def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended
 def _refitted(now: Amended, case: Case, progress: Progress) -> Amended:
     try:
         final = final_refit(case.train, case.validation, now.verdict.model, case.config.refine, progress)
-        extended(case, final)  # what is written of it can be made
-    except Exception as error:  # as above; the search's own model stays
+        extended(case, final)  # raises here if its posterior cannot be computed
+    except Exception as error:  # as above; the search's model stays
         final = replace(now.final, not_made=reason(error))
     state = f"{NOT_MADE}: {final.not_made}" if final.not_made else MADE
     return _state(replace(now, final=final), REFIT, state)
@@ -206,30 +205,30 @@ def _state(now: Amended, name: str, state: str) -> Amended:
 
 
 def separating_experiments(case: Case, models: Sequence[FittedModel], recording: Recording) -> tuple[Experiment, ...]:
-    """Experiments by how far apart they put the two models that they distinguish least, the best first.
+    """Candidate experiments by the distance of the two models that they distinguish least, the largest first.
 
-    Every one is within reach of whoever gave the training demonstration: the same motion on another clock (slower,
+    They are variants of the training motion that can be recorded on the same set-up: another time scaling (slower,
     faster, there and back, with a stop half-way), opened further, with a known weight at the hand, or in the air, away
-    from what the hand held.
+    from the object.
 
     Args:
         case: the recordings.
-        models: indistinguishable ones, each refitted.
-        recording: what the case was fitted to.
+        models: indistinguishable models, each refitted.
+        recording: the training recording.
 
     Returns:
-        Empty for a log without commands, whose motion cannot be asked for again.  Experiments that cannot be made come
-        last, and say why.
+        The experiments.  Those that cannot be simulated come last, with the reason.  Empty for a log without commands,
+        whose motion cannot be repeated.
     """
     if len(models) < 2 or not recording.command.size:
         return ()
     values = np.stack([m.values for m in models])
-    found = [_made(what, make) for what, make in _possible(case, values, recording)]
-    return tuple(sorted(found, key=lambda e: -np.inf if e.distance is None else e.distance, reverse=True))
+    experiments = [_simulated(what, make) for what, make in _possible(case, values, recording)]
+    return tuple(sorted(experiments, key=lambda e: -np.inf if e.distance is None else e.distance, reverse=True))
 
 
 def _possible(case: Case, values: np.ndarray, recording: Recording) -> Iterator[tuple[str, Callable[[], Experiment]]]:
-    """What there is to try in this scene, in words, and how each is made for models [K, D]."""
+    """Experiments in this scene: a description, and a function that simulates the models [K, D]."""
     known = case.train.cost
     config = case.train.comparison.config
 
@@ -255,9 +254,9 @@ def _possible(case: Case, values: np.ndarray, recording: Recording) -> Iterator[
         yield what, lambda: _experiment(what, known, _carrying(case, values))
 
 
-def _made(what: str, make: Callable[[], Experiment]) -> Experiment:
-    """An experiment, or why it cannot be made: the search is done, and one candidate must not end it."""
-    with warnings.catch_warnings():  # what there is to warn of was said of the recording itself
+def _simulated(what: str, make: Callable[[], Experiment]) -> Experiment:
+    """An experiment, or the reason of its failure, which must not end a finished search."""
+    with warnings.catch_warnings():  # the same warnings were issued for the recording itself
         warnings.simplefilter("ignore", UserWarning)
         try:
             return make()
@@ -266,22 +265,30 @@ def _made(what: str, make: Callable[[], Experiment]) -> Experiment:
 
 
 def untouched(scene: Scene) -> Scene:
-    """A scene whose hand grips by contact, without any contact: the robot moves as if nothing stood around it."""
+    """The scene without contacts and without a grip: the robot moves in free space."""
     model = copy.copy(scene.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return replace(scene, model=model, grip=None)
 
 
-def _further(known: Cost, recording: Recording, values: np.ndarray) -> Recording:
-    """The motion opened further, as a model [1, D] made it; ValueError where the hand does not get there."""
+def _further(known: AnyCost, recording: Recording, values: np.ndarray) -> Recording:
+    """The motion opened further, as simulated with a model [1, D].
+
+    Raises:
+        ValueError: the hand does not reach there.
+    """
     longer = opened_further(known.scene, recording, jax.tree.map(lambda a: a[0], known.rollouts(values)[0]))
     if longer is None:
         raise ValueError("the hand does not hold the object where it is open most, or does not reach further")
     return longer
 
 
-def _experiment(what: str, cost: Cost, values: np.ndarray) -> Experiment:
-    """The distance of the models [K, D] that an experiment distinguishes least; ValueError where a replay fails."""
+def _experiment(what: str, cost: AnyCost, values: np.ndarray) -> Experiment:
+    """The distance of those two of the models [K, D] that an experiment distinguishes least.
+
+    Raises:
+        ValueError: a replay fails.
+    """
     if cost.failed(values).any():
         raise ValueError("the simulation of one of the models fails on this motion")
     simulated = cost.whitened(values).astype(np.float64)

@@ -1,7 +1,7 @@
-"""What a search for missing effects leaves in its folder: gap.json and gap.npz, the extended model beside them.
+"""Files of a search for missing effects: gap.json, gap.npz and the extended model.
 
-The verdict is written when it is known; what is added to it later (`missing.amended`) is written again.
-docs/results-folder.md lists every entry.  No pickle.
+The verdict is written when it is known, and again after each amendment (`missing.amended`).  docs/results-folder.md
+lists every entry.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 
 from droid_jax.discrepancy.candidates import ScoreTest
 from droid_jax.discrepancy.case import Case, ResidualSet
-from droid_jax.discrepancy.fitting import FinalModel, fit_posterior, intervals, with_step_moves
+from droid_jax.discrepancy.fitting import FinalModel
 from droid_jax.discrepancy.maps import Localisation
+from droid_jax.discrepancy.posterior import fit_posterior, intervals, with_step_moves
 from droid_jax.discrepancy.selection import ValidationTest, bound_at
 from droid_jax.discrepancy.verdict import Alternatives, Verdict
 from droid_jax.files import GAP, GAP_TRACES, GAP_VERSION
@@ -31,7 +32,7 @@ FORMAT, VERSION = "droid_jax gap", GAP_VERSION
 
 
 def extended(case: Case, final: FinalModel) -> Extended:
-    """The extended model that a search hands on, as something to save."""
+    """The final model of a search as an extended model, which can be saved."""
     model = final.model
     values = model.values[case.full_space.columns(model.space)]
     gaussian = posterior(
@@ -58,10 +59,10 @@ def write_gap(
     Args:
         folder: of the run.
         case: the recordings.
-        verdict: the answer.
-        final: the model to hand on, the search's own while the final refit is to be made.
-        description: what else gap.json shall hold: "seconds", "versions", "device", "setup", ...
-        amendments: their states (`missing.Amended.states`); None where all that is due has been made.
+        verdict: of the search.
+        final: the final model; that of the search until the final refit is made.
+        description: further entries of gap.json: "seconds", "versions", "device", "setup", ...
+        amendments: states of the amendments (`missing.Amended.states`); None if none is due.
     """
     write_npz(folder / GAP_TRACES, gap_arrays(case, verdict))
     write_amended(folder, case, verdict, final, description, amendments)
@@ -75,14 +76,14 @@ def write_amended(
     description: Mapping[str, Any],
     amendments: Mapping[str, str] | None = None,
 ) -> None:
-    """Write what an amendment changes of `write_gap`'s files: the extended model, then gap.json."""
+    """Write the files of `write_gap` that an amendment changes: the extended model, then gap.json."""
     save_extended(folder, extended(case, final))
     more = {"final_model": _final_json(case, verdict, final), "amendments": dict(amendments or {})}
     write_json(folder / GAP, {**gap_json(case, verdict), **more, **description})
 
 
 def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
-    """The answer and its grounds as plain data."""
+    """The verdict as plain data, see docs/results-folder.md."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -143,10 +144,9 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
 
 
 def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
-    """The smoothed leading channel (torques, where compared) of each recording: the repeats, and the simulation before
-    and after.
+    """The smoothed leading channel (torques, if compared) of each recording: repeats, base model and final model.
 
-    Where one log has several roles, each has the instants of its own blocks.
+    If one log has several roles, each role has the instants of its blocks.
     """
     joints = _joints(case.train)
     out = {"joints": np.array(joints)}
@@ -154,13 +154,13 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
         residual_set = case.residual_sets[role]
         order = [_joints(residual_set).index(joint) for joint in joints]
         channel = residual_set.comparison.leading
-        mine = residual_set.instants_of(channel)
+        counted = residual_set.instants_of(channel)
         (simulated,) = residual_set.cost.smoothed(_before_after(residual_set, verdict))
-        before, after = simulated[:, mine][:, :, order]
-        repeats = channel.noise.repeats[:, mine][:, :, order]
+        before, after = simulated[:, counted][:, :, order]
+        repeats = channel.noise.repeats[:, counted][:, :, order]
         out |= {
-            f"{role}.time": channel.clock[mine],
-            f"{role}.measured": channel.noise.mean[mine][:, order],
+            f"{role}.time": channel.clock[counted],
+            f"{role}.measured": channel.noise.mean[counted][:, order],
             f"{role}.scatter": np.std(repeats, axis=0, ddof=1) if len(repeats) > 1 else np.zeros(repeats.shape[1:]),
             f"{role}.before": before,
             f"{role}.after": after,
@@ -169,7 +169,7 @@ def gap_arrays(case: Case, verdict: Verdict) -> dict[str, np.ndarray]:
 
 
 def _before_after(residual_set: ResidualSet, verdict: Verdict) -> np.ndarray:
-    """[2, D] values of the base model and of the extended one, the recording's own nuisances at their best."""
+    """[2, D] values of the base model and of the final model, with fitted per-recording nuisances."""
     return residual_set.at_best_nuisances(np.stack([verdict.base.values, verdict.model.values]))
 
 
@@ -192,7 +192,7 @@ def _alternatives(each: tuple[Alternatives, ...]) -> list[list[list[dict[str, st
 
 
 def _final_json(case: Case, verdict: Verdict, final: FinalModel) -> dict[str, Any]:
-    """Which recordings the final model is fitted to, and U of each role with it; null where it blows up."""
+    """Names of the recordings that the final model is fitted to, and its U by role; None if the replay blows up."""
 
     def of(residual_set: ResidualSet) -> float | None:
         return finite(residual_set.resampling.discrepancy(residual_set.residuals(final.model.values)))
@@ -204,9 +204,11 @@ def _final_json(case: Case, verdict: Verdict, final: FinalModel) -> dict[str, An
 
 
 def _discrepancy(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict[str, Any]:
-    """U and the paper's distance (equation 1), before and after; closed: None where there was nothing beyond U0.
+    """U and the distance of equation 1, of the base model and of the final model.
 
-    The distance is in the compared channel's unit, of several in noise units; its keys are named for torques.
+    "torque_before" and "torque_after" hold the distance of whatever channels are compared, in "distance_unit" of
+    gap.json: the channel's unit, or noise units for several channels.  (The keys date from searches of torques alone.)
+    "closed" is None if U of the base model is not above U0.
     """
     before, after = verdict.discrepancies[role]
     both = _before_after(residual_set, verdict)
@@ -222,7 +224,7 @@ def _discrepancy(role: str, residual_set: ResidualSet, verdict: Verdict) -> dict
 
 
 def _ranking(found: ScoreTest) -> list[dict[str, Any]]:
-    """Every candidate with its best shape, by what that explains."""
+    """Every candidate with its best shape parameters, by the share that it explains."""
     best: dict[EffectKey, int] = {}
     for k in found.ranking():
         best.setdefault(found.directions[k].candidate.key, k)
@@ -256,7 +258,7 @@ def _cells(found: Localisation) -> list[dict[str, Any]]:
 
 
 def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
-    """Of each effect of the answer, alternatives and hints with it: what it is, its signature, and its likes."""
+    """Effect -> description, signature and similar effects, for those in the verdict, its alternatives and hints."""
     answers = [(verdict.effects, verdict.indistinguishable), *((h.effects, h.indistinguishable) for h in verdict.hints)]
     named = {key.effect for effects, _ in answers for key in effects}
     named |= {key.effect for _, each in answers for alternatives in each for keys in alternatives for key in keys}
@@ -275,7 +277,7 @@ def _about(case: Case, verdict: Verdict) -> dict[str, dict[str, Any]]:
 def _parameters(
     case: Case, verdict: Verdict, kind: Literal["coefficients", "shape_parameters"]
 ) -> list[dict[str, Any]]:
-    """Coefficients or shape parameters of the model with intervals, each at the first of the parts that share it."""
+    """Coefficients or shape parameters of the model with intervals; a shared one is listed for its first part."""
     model, what = verdict.model, {e.name: e.description for e in case.effects}
     first: dict[str, Candidate] = {}
     for part in model.parts:
@@ -298,7 +300,10 @@ def _parameters(
 
 
 def _reached(parameter: Parameter, value: float, span: tuple[float, float], side: str) -> str:
-    """The bound that a value is near, where it or its interval reaches it: a hundredth of a wide range may be far."""
+    """The bound `side` ("lower" or "upper") if the value or its interval reaches it, otherwise empty.
+
+    `fit.bound_of`, which gives `side`, allows a distance that may be large if the range is wide.
+    """
     near = 1e-4 * (parameter.high - parameter.low)
     if side == "lower":
         return side if min(value, span[0]) <= parameter.low + near else ""
@@ -306,7 +311,7 @@ def _reached(parameter: Parameter, value: float, span: tuple[float, float], side
 
 
 def _shifts(case: Case, verdict: Verdict) -> list[dict[str, Any]]:
-    """How the base parameters moved when the effects came in, beside their deviation in the base fit."""
+    """Base parameters before and after the effects were added, with their posterior deviation in the base fit."""
     columns = case.full_space.columns(case.base)
     deviation = fit_posterior(case.train, verdict.base).physical_std
     before, after = verdict.base.values[columns], verdict.model.values[columns]

@@ -1,4 +1,4 @@
-"""Which effects belong into the model: validation tests with frozen parameters on another motion."""
+"""Selection of effects: validation tests of fitted models on another motion, and the choice among those that pass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 from droid_jax.discrepancy.candidates import Proposal, ScoreTest
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, consistent_with_zero, intervals, remaining_discrepancy
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.posterior import consistent_with_zero, intervals, remaining_discrepancy
 from droid_jax.discrepancy.statistics import resample_weights
 from droid_jax.identify.fit import bound_of
 from droid_jax.model.effect_interface import Effect
@@ -22,7 +23,7 @@ from droid_jax.model.parameters import Parameter
 
 
 class Reason(enum.Enum):
-    """Why a model fails its validation test."""
+    """Reasons for which a model fails its validation test."""
 
     NOT_CONFIRMED = "not confirmed"
     BELOW_MINIMUM_SIZE = "below minimum size"
@@ -37,12 +38,12 @@ class Reason(enum.Enum):
     DOMINATED = "dominated"
 
 
-WEAK = {Reason.NOT_CONFIRMED, Reason.BELOW_MINIMUM_SIZE}  # for these alone an effect may yet be the truth
+WEAK = {Reason.NOT_CONFIRMED, Reason.BELOW_MINIMUM_SIZE}  # an effect with these reasons alone may still be present
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A reason and its numbers, for people."""
+    """A reason, and a text with its numbers."""
 
     reason: Reason
     text: str
@@ -50,16 +51,16 @@ class Rejection:
 
 @dataclass(frozen=True)
 class ValidationTest:
-    """An extended model's test: everything it had to pass, and the reasons where it did not.
+    """The validation test of a model.
 
-    keys: the effects in it.
-    before: how many effects the model had that it extends.
-    discrepancy_train, discrepancy_validation: U with it on both recordings.
-    p: of the improvement on the validation recording.
-    interval: of each new coefficient.
+    keys: its effects.
+    before: number of effects in the model that it extends.
+    discrepancy_train, discrepancy_validation: its U on both recordings.
+    p: p-value of its gain on the validation recording.
+    interval: coefficient -> interval, of each new coefficient.
     chosen: share of the resamples in which it, or a model indistinguishable from it, is best.
-    indistinguishable: effects of the models that cannot be distinguished from it.
-    reasons: why it lost, empty where it passed.
+    reasons: reasons for its rejection, empty if it passed.
+    indistinguishable: effects of each model that is indistinguishable from it.
     """
 
     keys: Keys
@@ -74,12 +75,12 @@ class ValidationTest:
 
     @property
     def passed(self) -> bool:
-        """No reason against it."""
+        """Whether there is no reason against it."""
         return not self.reasons
 
     @property
     def weak(self) -> bool:
-        """It lost for nothing but its size or its significance, and may yet be the truth."""
+        """Whether it failed for its size or its significance alone, so that its effect may still be present."""
         return bool(self.reasons) and all(r.reason in WEAK for r in self.reasons)
 
 
@@ -88,14 +89,14 @@ TestedModel = tuple[FittedModel, ValidationTest]
 
 @dataclass(frozen=True, eq=False)
 class SelectionStep:
-    """One step of the search: what was asked, what was tried, and what won.
+    """One step of the search.
 
-    score_test: of the model that stood before.
+    score_test: of the model before the step.
     before: the effects in it.
-    ranked: what could be added, the best first.
-    nearest: of these the ones that did best in one step, whether or not they were refitted.
+    ranked: proposals of the score test, the best first.
+    nearest: proposals with the best one-step fits, refitted or not.
     tried, tests: the refitted models and their validation tests.
-    selected, chosen: the one that does best and its test, or None.
+    selected, chosen: the selected model and its test, or None.
     """
 
     score_test: ScoreTest
@@ -109,7 +110,7 @@ class SelectionStep:
 
     @property
     def indistinguishable(self) -> tuple[FittedModel, ...]:
-        """Models that cannot be distinguished from the winner and lost, if at all, for size or significance alone."""
+        """Models that are indistinguishable from the selected one and passed, or failed for a weak reason alone."""
         if self.chosen is None:
             return ()
         both = zip(self.tried, self.tests, strict=True)
@@ -127,32 +128,32 @@ def validation_tests(
     seed: int = 0,
     natural_bounds: Collection[str] = (),
 ) -> list[ValidationTest]:
-    """Test extended models against the one that they extend, and against each other.
+    """Test models against the one that they extend, and against each other.
 
-    One batch of replays; U of one that blows up is infinite.
+    The models are replayed in one batch.  U of a model whose replay blows up is infinite.
 
     Args:
-        train: what the models are fitted to.
-        validation: what they are tested on.
+        train: residual set that the models are fitted to.
+        validation: residual set that they are tested on.
         before: the model that they extend.
         models: to test.
         minimum_sizes: coefficient -> minimum effect size.
-        base_discrepancy: U of the model without any effect on the validation recording.
+        base_discrepancy: U of the base model on the validation recording.
         discretisation_error: U0.
         seed: of the resamples.
-        natural_bounds: coefficients that may stand at their bound.
+        natural_bounds: coefficients whose bounds are physical limits, where they may stand.
     """
     config, rows = validation.config, validation.resampling
     commons = validation.common(np.stack([before.values, *(m.values for m in models)]))
-    repeats = [rows.residuals(c) for c in commons]
-    left = np.nan_to_num([rows.discrepancy(r) for r in repeats], nan=np.inf)
-    squares = np.array([np.sum(r**2, axis=1) for r in repeats])
+    residuals = [rows.residuals(c) for c in commons]
+    u = np.nan_to_num([rows.discrepancy(r) for r in residuals], nan=np.inf)  # of `before`, then of the models
+    squares = np.array([np.sum(r**2, axis=1) for r in residuals])
     draws = resample_weights(rows.units, config.resamples, seed)
     losses = np.nan_to_num(rows.losses(commons[1:], draws), nan=np.inf)
-    fitted = np.array([m.discrepancy for m in models])
+    u_train = np.array([m.discrepancy for m in models])
     same = indistinguishable(
-        left[1:],
-        fitted,
+        u[1:],
+        u_train,
         losses,
         discretisation_error,
         validation.equivalence_factor,
@@ -160,29 +161,29 @@ def validation_tests(
         config.equivalence_doubt,
     )
     winners = np.bincount(np.argmin(losses, axis=1), minlength=len(models)) / len(losses)
-    best = min(zip(left[1:], models, strict=True), key=lambda lm: lm[0])[1]
-    beside = functools.cache(lambda: remaining_discrepancy(train, validation, before))
+    best = models[int(np.argmin(u[1:]))]
+    remaining_before = functools.cache(lambda: remaining_discrepancy(train, validation, before))
     out = []
     for k, model in enumerate(models):
-        p = rows.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(left[k + 1]) else 1.0
+        p = rows.gain_p_value(0.5 * (squares[0] - squares[k + 1])) if np.isfinite(u[k + 1]) else 1.0
         chosen = float(winners[same[k]].sum())
         spans = {a: s for a, s in intervals(train, model).items() if a not in before.coefficients}
         if before.parts:
-            beyond = functools.partial(remaining_discrepancy, train, validation, model)
-            enough = much_more(left[0], left[k + 1], beside, beyond, base_discrepancy, config)
+            remaining_after = functools.partial(remaining_discrepancy, train, validation, model)
+            enough = reduced_enough(u[0], u[k + 1], remaining_before, remaining_after, base_discrepancy, config)
         else:
-            enough = left[k + 1] <= (1 - config.least_gain) * left[0]
+            enough = u[k + 1] <= (1 - config.least_gain) * u[0]
         reasons = [
             *significance_reasons(p, config),
             *_size_reasons(train, model, spans, minimum_sizes),
-            *_gain_reasons(left[0], left[k + 1], base_discrepancy, enough, discretisation_error, config),
+            *_gain_reasons(u[0], u[k + 1], base_discrepancy, enough, discretisation_error, config),
             *_coefficient_reasons(train, model, spans, natural_bounds),
             *_stability_reasons(chosen, best, config),
         ]
         others = tuple(models[i].keys for i in np.flatnonzero(same[k]).tolist() if i != k)
         out.append(
             ValidationTest(
-                model.keys, len(before.parts), model.discrepancy, float(left[k + 1]), p, spans, chosen,
+                model.keys, len(before.parts), model.discrepancy, float(u[k + 1]), p, spans, chosen,
                 tuple(reasons), others,
             )
         )  # fmt: skip
@@ -190,60 +191,66 @@ def validation_tests(
 
 
 def indistinguishable(
-    left: np.ndarray,
-    fitted: np.ndarray,
+    u: np.ndarray,
+    u_train: np.ndarray,
     losses: np.ndarray,
     discretisation_error: float,
     factor: float,
     equal_fit: float,
     doubt: float,
 ) -> np.ndarray:
-    """[K, K] bool, which models cannot be distinguished.
+    """[K, K] bool, pairs of models that cannot be distinguished.
 
-    What two wrong forms leave says little about which is nearer the truth, so a ratio counts and not significance.
+    The remaining discrepancies of two wrong forms say little about which form is nearer to the truth.  So a ratio
+    decides and not significance.
 
     Args:
-        left: [K] U on the validation recording.
-        fitted: [K] U on the training recording.
-        losses: [R, K] in resamples of the validation repeats.
+        u: [K] U on the validation recording.
+        u_train: [K] U on the training recording.
+        losses: [R, K] squared residual in resamples of the validation repeats.
         discretisation_error: U0.
-        factor: ratio of U beyond U0 up to which two models are indistinguishable.
-        equal_fit: difference of U on the training recording that is none.
-        doubt: share of the resamples in which the worse one must be better for the same.
+        factor: see `SelectionConfig.equivalence_factor`.
+        equal_fit: difference of U on the training recording that is ignored.
+        doubt: see `SelectionConfig.equivalence_doubt`.
     """
-    above, above_fitted = (np.maximum(u - discretisation_error, 1e-12) for u in (left, fitted))
-    near = above[None, :] <= factor * above[:, None]
-    near &= above_fitted[None, :] <= factor * above_fitted[:, None] + equal_fit
+    beyond, beyond_train = (np.maximum(each - discretisation_error, 1e-12) for each in (u, u_train))
+    near = beyond[None, :] <= factor * beyond[:, None]
+    near &= beyond_train[None, :] <= factor * beyond_train[:, None] + equal_fit
     better = np.mean(losses[:, None, :] < losses[:, :, None], axis=0) > doubt
     as_good = near | better
-    return (as_good & as_good.T) | np.eye(len(left), dtype=bool)
+    return (as_good & as_good.T) | np.eye(len(u), dtype=bool)
 
 
-def much_more(
+def reduced_enough(
     before: float,
     after: float,
-    beside: Callable[[], float],
-    beyond: Callable[[], float],
+    remaining_before: Callable[[], float],
+    remaining_after: Callable[[], float],
     base_discrepancy: float,
     config: SelectionConfig,
 ) -> bool:
-    """Whether a further effect takes its share of the remaining U on the validation recording.
+    """Whether a further effect reduces U on the validation recording by `SelectionConfig.least_further_gain`.
 
-    before, after: U.  beside, beyond: the same less what the uncertainty of each fit leaves there, which no effect can
-    take; where U falls by less than the share, that may do, if it is a share of the base model's U too.  (They are
-    expensive: asked for where it matters.)
+    If U itself falls by less, U beyond the uncertainty of each fit (`remaining_discrepancy`) may fall by that share: no
+    effect can explain the rest.  It must fall by `SelectionConfig.least_share` of the base model's U too.
+
+    Args:
+        before, after: U without and with the effect.
+        remaining_before, remaining_after: functions that return the remaining U; expensive, called only if needed.
+        base_discrepancy: U of the base model.
+        config: thresholds.
     """
     share = 1 - config.least_further_gain
     if after <= share * before:
         return True
     if not after < before:
         return False
-    left, rest = beside(), beyond()
-    return rest <= share * left and left - rest >= config.least_share * base_discrepancy
+    u_before, u_after = remaining_before(), remaining_after()
+    return u_after <= share * u_before and u_before - u_after >= config.least_share * base_discrepancy
 
 
 def significance_reasons(p: float, config: SelectionConfig) -> list[Rejection]:
-    """A gain that chance may make is a reason against an effect."""
+    """The reason against an effect whose gain has the p-value `p`, if it is not significant."""
     if p < config.confirmation:
         return []
     return [Rejection(Reason.NOT_CONFIRMED, f"not confirmed by the validation recording (p = {p:.2g})")]
@@ -300,12 +307,15 @@ def _stability_reasons(chosen: float, best: FittedModel, config: SelectionConfig
 
 
 def with_unit(number: float, p: Parameter) -> str:
-    """ "0.5 N m": a number in a parameter's unit."""
+    """A number with a parameter's unit, e.g. "0.5 N m"."""
     return f"{number:g} {p.unit}".removesuffix(" -").strip()
 
 
 def zero_warning(train: ResidualSet, model: FittedModel, part: Candidate) -> str:
-    """ "its coefficient may be zero (90 % interval 0 to 0.58 N m)" of a part of which that is so; empty else."""
+    """Text for a part that is consistent with zero, e.g. "its coefficient may be zero (90 % interval 0 to 0.58 N m)".
+
+    Empty for other parts.
+    """
     if not consistent_with_zero(train, model, part):
         return ""
     spans = intervals(train, model, part.coefficients)
@@ -315,7 +325,7 @@ def zero_warning(train: ResidualSet, model: FittedModel, part: Candidate) -> str
 
 
 def past_bound(train: ResidualSet, model: FittedModel, coefficient: str) -> str:
-    """ "more than 0.5 N m" of a coefficient at a bound that is not neutral; empty of others."""
+    """Text for a coefficient at a bound other than neutral, e.g. "more than 0.5 N m"; empty for others."""
     p = train.cost.space[coefficient]
     value = model.values[train.cost.space.index(coefficient)]
     margin = train.config.bound_margin * (p.high - p.low)
@@ -327,7 +337,7 @@ def past_bound(train: ResidualSet, model: FittedModel, coefficient: str) -> str:
 
 
 def bound_at(train: ResidualSet, model: FittedModel, name: str) -> str:
-    """ "lower" or "upper": the bound that a free parameter sits on; empty for none."""
+    """Bound at which a free parameter stands, "lower" or "upper"; empty for none."""
     space = train.cost.space
     return bound_of(space[name], float(model.values[space.index(name)]))
 
@@ -335,9 +345,10 @@ def bound_at(train: ResidualSet, model: FittedModel, name: str) -> str:
 def selected(
     tested: Sequence[TestedModel], discretisation_error: float, base_discrepancy: float, config: SelectionConfig
 ) -> TestedModel | None:
-    """The model that leaves least on the validation recording; of those that leave about as little, the simplest.
+    """The model with the smallest U on the validation recording, or the simplest of nearly equal ones.
 
-    None where the one that leaves least is too weak: nothing worse is named instead.
+    None if no model passed, or if the one with the smallest U has a weak reason against it.  A model with a larger U is
+    not selected in its place.
     """
     standing = [(m, t) for m, t in tested if t.passed or t.weak]
     _, chosen = min(standing, key=lambda mt: mt[1].discrepancy_validation, default=(None, None))
@@ -350,7 +361,7 @@ def selected(
 
 
 def simplest(tied: Sequence[TestedModel]) -> TestedModel:
-    """The model with the fewest parameters: a flexible form mimics a plain one."""
+    """The model with the fewest parameters, since a flexible form can imitate a simple one."""
     return min(tied, key=lambda mt: (sum(len(c.free) for c in mt[0].parts), mt[1].discrepancy_validation))
 
 
@@ -361,47 +372,50 @@ def without_dominated(
     discretisation_error: float,
     config: SelectionConfig,
 ) -> list[ValidationTest]:
-    """The tests, those rejected that hold the winner as a special case and leave no less."""
-    plain, chosen = winner
+    """The tests, with those rejected whose model holds the winner as a special case and has no smaller U."""
+    special, chosen = winner
     beyond = max(chosen.discrepancy_validation - discretisation_error, 0.0)
-    left = discretisation_error + config.generality_factor * beyond
-    general = more_general(effects, plain, [m for m, _ in tested])
-    text = f"holds {names_of(plain.keys)} as a special case and leaves no less"
+    limit = discretisation_error + config.generality_factor * beyond
+    general = more_general(effects, special, [m for m, _ in tested])
+    text = f"holds {names_of(special.keys)} as a special case and reduces the discrepancy no further"
     return [
         replace(t, reasons=(Rejection(Reason.DOMINATED, text),))
-        if more and max(t.discrepancy_validation, discretisation_error) >= left and (t.passed or t.weak)
+        if more and max(t.discrepancy_validation, discretisation_error) >= limit and (t.passed or t.weak)
         else t
         for (_, t), more in zip(tested, general, strict=True)
     ]
 
 
-def more_general(effects: Sequence[Effect], plain: FittedModel, models: Sequence[FittedModel]) -> list[bool]:
-    """Which models are a plain one but for effects that hold one of its own, at its location, as a special case."""
-    holds = {e.name: e.special_cases for e in effects}
+def more_general(effects: Sequence[Effect], special: FittedModel, models: Sequence[FittedModel]) -> list[bool]:
+    """Whether each model equals a special one, except for effects that hold its effects as special cases."""
+    special_cases = {e.name: e.special_cases for e in effects}
 
     def general(model: FittedModel) -> bool:
-        ours, theirs = ({(c.effect, c.location) for c in m.parts} for m in (plain, model))
-        own, other = tuple(ours - theirs), itertools.permutations(theirs - ours)
-        pairs = (zip(own, order, strict=True) for order in other if 0 < len(own) == len(order))
-        return any(all(a[1] == b[1] and a[0] in holds[b[0]] for a, b in some) for some in pairs)
+        of_special, of_model = ({(c.effect, c.location) for c in m.parts} for m in (special, model))
+        replaced, orders = tuple(of_special - of_model), itertools.permutations(of_model - of_special)
+        pairs = (zip(replaced, order, strict=True) for order in orders if 0 < len(replaced) == len(order))
+        return any(all(a[1] == b[1] and a[0] in special_cases[b[0]] for a, b in some) for some in pairs)
 
     return [general(m) for m in models]
 
 
 def doubts(train: ResidualSet, model: FittedModel, natural_bounds: Collection[str] = ()) -> tuple[str, ...]:
-    """What to doubt of the effects in a final model: a form that does not fit, a size that may be zero.
+    """Doubts about the effects in a final model: a form that does not fit, a size that may be zero or is at a bound.
 
-    One text for each: "the form of latch at door does not fit: latch_width at its lower bound, 0.01 rad".  A shape
-    parameter is bounded by what such a thing can be.  One that the recordings constrain, and that wants beyond, says
-    that the library's form is not the robot's, although its location and type may be right.
+    One text for each, e.g. "the form of latch at door does not fit: latch_width at its lower bound, 0.01 rad".  The
+    bounds of a shape parameter hold all plausible values.  A parameter that the recordings constrain to a bound shows
+    that the form in the library differs from the robot's, although location and type may be right.
 
-    natural_bounds: coefficients that may stand at their bound.
+    Args:
+        train: residual set that the model was fitted to.
+        model: the final model.
+        natural_bounds: coefficients whose bounds are physical limits, where they may stand.
     """
     out = []
     for part in model.parts:
-        wrong = [text for name in part.shape_parameters if (text := _misfit(train, model, name))]
-        if wrong:
-            out.append(f"the form of {part.key} does not fit: {' and '.join(wrong)}")
+        misfits = [text for name in part.shape_parameters if (text := _misfit(train, model, name))]
+        if misfits:
+            out.append(f"the form of {part.key} does not fit: {' and '.join(misfits)}")
         if zero := zero_warning(train, model, part) if part.coefficients else "":
             out.append(f"of {part.key}, {zero}")
         large = [
@@ -415,6 +429,7 @@ def doubts(train: ResidualSet, model: FittedModel, natural_bounds: Collection[st
 
 
 def _misfit(train: ResidualSet, model: FittedModel, name: str) -> str:
+    """Text for a well-constrained shape parameter at a bound; empty for others."""
     p, side = train.cost.space[name], bound_at(train, model, name)
     low, high = intervals(train, model, [name])[name]
     if not side or high - low > train.config.shape_interval_share * (p.high - p.low):

@@ -1,17 +1,18 @@
-"""The discrepancy U and its tests, by sign flips of whole repeats, or of blocks of time where there are no repeats.
+"""The discrepancy U and its tests by sign flips of whole repeats, or of blocks of time in logs without repeats.
 
-Under "nothing is missing" the residuals of a repeat are as likely as their opposite.  A block is longer than the noise
-stays correlated, so that its score too is about as likely as its opposite, whatever the other blocks' are.  Four things
-differ from repeats:
+Under the null hypothesis, that nothing is missing, a repeat's residuals and their negatives are equally likely.  A
+block is longer than the noise's correlation time.  Its score and the score's negative are therefore about equally
+likely, independently of the other blocks.  Blocks differ from repeats in four points:
 
-* U is the mean square of the residual, noise included: nothing separates noise from what every repeat would share.
-* A block's score depends on what moves in it, so scores of a present effect differ from block to block and
-  Student's t stops growing with the effect.  The statistic is the share of the residual that an effect takes.
-* The base fit has taken its part out of all blocks together.  Flipped scores lose more of themselves to it than
-  the unflipped ones, so each statistic is divided by what is left of its sensitivity after flipping and projecting.
-  Without that, 17 of 100 Panda logs with nothing missing fell below p = 0.05 (linear replays; scaled: 7).
-* Base parameters whose truth is off their prior's mean leave a residual that every block shares.  With few blocks and
-  many nuisances that counts, so sensitivities are projected with loose priors (`BlocksConfig.prior_slack`).
+* U is the mean square of the residual and includes the noise, which only repeats separate from a common residual.
+* A block's score depends on the motion in it.  Scores of a present effect differ from block to block, and Student's t
+  stops growing with the effect.  The statistic is therefore the share of the residual that an effect explains.
+* The base fit was projected out of all blocks together.  Flipped scores lose a larger share to that projection than
+  unflipped ones.  Each statistic is therefore divided by the size of its sensitivity after flipping and projection.
+  Without it, 17 of 100 Panda logs with nothing missing had p < 0.05 (linear replays; with it: 7).
+* Base parameters whose true values differ from their prior means leave a residual that all blocks share.  This matters
+  with few blocks and many nuisances.  Sensitivities are therefore projected with wide priors
+  (`BlocksConfig.prior_slack`).
 
 Sources: R. A. Fisher, The Design of Experiments, 1935, section 21; Westfall and Young, Resampling-Based Multiple
 Testing, 1993 (the largest statistic over many directions); Hemerik, Goeman, Finos, JRSS B 2020 (flipping score
@@ -31,16 +32,16 @@ from droid_jax.cost.noise import DEFAULT_NOISE, correlation_time, detrend
 from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.recordings.split import FEWEST_REPEATS
 
-EXACT = 12  # up to this many repeats all flips are tried
-DRAWS = 4096
-OUTSIDE = -1  # the block of an instant that belongs to another part
-CHUNK = 256  # flips at once
+EXACT = 12  # largest number of repeats or blocks of which all sign flips are computed
+DRAWS = 4096  # random sign flips, or orders, of more than that
+OUTSIDE = -1  # block number of an instant that belongs to another part
+CHUNK = 256  # flips that are projected at once
 
 
 def discrepancy(residuals: np.ndarray) -> float:
-    """U of residuals [N, M]: mean product of different repeats' residuals, per residual.
+    """U of residuals [N, M]: the mean product of the residuals of two different repeats.
 
-    Noise of the repeats has no part in it; it is the mean square of what all repeats share.
+    It is an unbiased estimate of the mean square of the common residual: independent noise of the repeats averages out.
     """
     count, size = residuals.shape
     total = residuals.sum(axis=0)
@@ -53,9 +54,10 @@ def discrepancies(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def detrended(x: np.ndarray) -> np.ndarray:
-    """x [N, ...] of repeats without its trend over their order: the same mean, the scatter of N - 2 degrees of freedom.
+    """Remove the linear trend over the order of the repeats from x [N, ...].
 
-    What grows or fades steadily over the repeats (a friction or a sensor that warms up) is no noise.
+    The mean is unchanged; deviations from it are scaled for N - 2 degrees of freedom.  A steady change over the repeats
+    (a friction or a sensor that warms up) is not noise.
     """
     if len(x) < 3:
         return x
@@ -64,10 +66,14 @@ def detrended(x: np.ndarray) -> np.ndarray:
 
 
 def sign_flips(repeats: int, seed: int = 0, *, one_sided: bool = False) -> np.ndarray:
-    """[F, N] of +1 and -1; the first row is the data unflipped.
+    """[F, N] sign flips of N repeats or blocks; the first row leaves the data unflipped.
 
-    Up to EXACT repeats all there are, of two opposite ones but one: for statistics that do not see the difference.
-    one_sided: both, for those that do.
+    All flips for up to `EXACT` repeats, otherwise `DRAWS` random ones.
+
+    Args:
+        repeats: N.
+        seed: of the random flips.
+        one_sided: include both of two opposite flips, for statistics whose sign matters.
     """
     if repeats <= EXACT:
         bits = np.arange(2 ** (repeats if one_sided else repeats - 1))[:, None] >> np.arange(repeats) & 1
@@ -79,7 +85,7 @@ def sign_flips(repeats: int, seed: int = 0, *, one_sided: bool = False) -> np.nd
 
 
 def t_values(scores: np.ndarray, flips: np.ndarray) -> np.ndarray:
-    """[F, K] Student's t of scores [K, N] over the repeats, for every flip."""
+    """[F, K] Student's t over the repeats of scores [K, N], for every flip [F, N]."""
     count = scores.shape[1]
     mean = flips @ scores.T / count
     variance = np.maximum(np.mean(scores**2, axis=1) - mean**2, 1e-30) * count / (count - 1)
@@ -87,75 +93,77 @@ def t_values(scores: np.ndarray, flips: np.ndarray) -> np.ndarray:
 
 
 def one_sided_p(gains: np.ndarray) -> float:
-    """p-value of gains [N] being above zero on average."""
+    """One-sided p-value of the hypothesis that the mean of the gains [N] is zero, against a positive mean."""
     t = t_values(gains[None], sign_flips(len(gains), one_sided=True))[:, 0]
     return float(np.mean(t >= t[0] - 1e-12))
 
 
 def largest_detrended_t(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
-    """[K] t of each of K directions with scores [K, N], and the p-value of the largest |t| among them.
+    """[K] t of K directions with scores [K, N], and the p-value of the largest |t|, without the trend over the repeats.
 
-    Without what grows or fades steadily over the repeats (`detrended`).
-
-    A line taken out costs a degree of freedom, but not where rows were flipped after it: the unflipped t is compared as
-    the quantile of theirs that it is of its own.  Without that 1.6 % of noise alone fell below p = 0.01 (ten repeats,
-    forty independent directions; `tests/discrepancy/test_statistics.py`).
+    Removing the trend costs the unflipped scores a degree of freedom.  Scores that are flipped afterwards do not lose
+    it.  The unflipped t is therefore converted to the flipped t of the same tail probability.  Without it 1.6 % of
+    noise alone had p < 0.01 (ten repeats, forty independent directions; `tests/discrepancy/test_statistics.py`).
     """
     count = scores.shape[1]
     t = t_values(detrended(scores.T).T, sign_flips(count, seed))
-    own, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
-    found = flipped.isf(own.sf(np.max(np.abs(t[0]))))
-    return t[0], float(np.mean(np.max(np.abs(t), axis=1) >= found * (1 - 1e-12)))
+    unflipped, flipped = scipy.stats.t(max(count - 2, 1)), scipy.stats.t(count - 1)
+    largest = flipped.isf(unflipped.sf(np.max(np.abs(t[0]))))
+    return t[0], float(np.mean(np.max(np.abs(t), axis=1) >= largest * (1 - 1e-12)))
 
 
 def detrended_discrepancy_p_values(residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """[K] p-value of each cell's U being above zero, without what grows or fades steadily over the repeats.
+    """[K] p-value of U = 0 in each cell, without the trend over the repeats.
 
-    residuals [N, M], cells [K, M] bool.  Where a line was taken out, the products of different repeats have a part of
-    their own (`_taken_out`), which adds up to next to nothing unflipped and to something under most flips: it is put
-    back.  Without that hardly anything is found below U = M^-1/2 (U = 0.02 of 1400 residuals, eight repeats, p < 0.01:
-    1 in 50, and now 2 in 3; `tests/discrepancy/test_statistics.py`).
+    Args:
+        residuals: [N, M] of the repeats.
+        cells: [K, M] bool.
+
+    Removing the trend correlates the residuals of different repeats (`_detrending_products`).  These products nearly
+    cancel unflipped, but not under most flips.  They are therefore subtracted.  Without it a U below M^-1/2 is hardly
+    ever significant (U = 0.02 of 1400 residuals, eight repeats, p < 0.01: 1 in 50, with it 2 in 3;
+    `tests/discrepancy/test_statistics.py`).
     """
     flips, rows, out = sign_flips(len(residuals)), detrended(residuals), []
     for cell in cells:
         gram = rows[:, cell] @ rows[:, cell].T
-        gram -= _taken_out(gram)
+        gram -= _detrending_products(gram)
         np.fill_diagonal(gram, 0.0)  # squares do not change sign
         products = np.einsum("fn,nm,fm->f", flips, gram, flips)
         out.append(float(np.mean(products >= products[0] - 1e-12 * abs(products[0]))))
     return np.array(out)
 
 
-def _taken_out(gram: np.ndarray) -> np.ndarray:
-    """[N, N] what taking the line out makes of the products [N, N] of repeats that share nothing.
+def _detrending_products(gram: np.ndarray) -> np.ndarray:
+    """[N, N] expected products of detrended repeats that hold independent noise alone.
 
-    Each repeat has a noise of its own size, estimated from the repeats' deviations from their mean.
+    The noise variance of each repeat is estimated from the products' [N, N] deviations from the repeats' mean.
     """
     count = len(gram)
-    made = detrended(np.eye(count))
-    apart = made - 1.0 / count
+    detrending = detrended(np.eye(count))
+    deviations = detrending - 1.0 / count
     centred = np.eye(count) - 1.0 / count
     squares = np.diag(centred @ gram @ centred)
-    return made @ np.diag(np.maximum(np.linalg.lstsq(apart**2, squares)[0], 0.0)) @ made.T
+    return detrending @ np.diag(np.maximum(np.linalg.lstsq(deviations**2, squares)[0], 0.0)) @ detrending.T
 
 
 def benjamini_hochberg(p: np.ndarray, level: float) -> np.ndarray:
-    """[K] bool, the hypotheses rejected at a false discovery rate.  Benjamini and Hochberg, JRSS B 1995."""
+    """[K] bool, hypotheses rejected at a false discovery rate `level`.  Benjamini and Hochberg, JRSS B 1995."""
     return scipy.stats.false_discovery_control(p, method="bh") <= level
 
 
 def resample_weights(count: int, draws: int, seed: int = 0) -> np.ndarray:
-    """[R, N] weights of the repeats in R resamples, each row summing to one."""
+    """[R, N] weights of N repeats in R bootstrap resamples; each row sums to one."""
     return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws) / count
 
 
 def largest_trend(scores: np.ndarray, seed: int = 0) -> tuple[int, float, float]:
-    """Which of K scores [K, N] changes most steadily over the repeats' order.
+    """The strongest linear trend of K scores [K, N] over the order of the repeats.
 
-    If the order says nothing, every other order is as likely (Fisher, section 21).
+    The p-value is that of a permutation test of the order (Fisher, section 21).
 
     Returns:
-        Its index, its slope from one repeat to the next, and the p-value of a trend as strong in any of them.
+        The score's index, its slope per repeat, and the p-value of the largest trend among all scores.
     """
     count = scores.shape[1]
     order = np.arange(count) - 0.5 * (count - 1)
@@ -168,30 +176,30 @@ def largest_trend(scores: np.ndarray, seed: int = 0) -> tuple[int, float, float]
 
 
 class Resampling(Protocol):
-    """How the rows of a residual set (one for each repeat or block) come about, and the tests on them."""
+    """The rows of a residual set, one for each repeat or block, and the tests on them."""
 
     @property
     def repeated(self) -> bool:
-        """Whether rows are repeats, which separate noise from what they share; blocks of one motion do not."""
+        """Whether rows are repeats, which separate noise from the common residual; blocks of one motion do not."""
         ...
 
     @property
     def units(self) -> int:
-        """Number of rows: what is flipped and resampled."""
+        """Number of rows N, which are flipped and resampled."""
         ...
 
     @property
     def size(self) -> int:
-        """How many residuals the log likelihood holds: U of one is half of this."""
+        """Number of residuals in the log likelihood; U = 1 adds half of it to the objective."""
         ...
 
     @property
     def counted(self) -> np.ndarray:
-        """[M] bool, residuals that count."""
+        """[M] bool, residuals that belong to the set."""
         ...
 
     def residuals(self, common: np.ndarray) -> np.ndarray:
-        """[N, M] of every row, from the common residual [M], which is their mean."""
+        """[N, M] residuals of every row, from the common residual [M], which is their mean."""
         ...
 
     def discrepancy(self, residuals: np.ndarray) -> float:
@@ -203,15 +211,20 @@ class Resampling(Protocol):
         ...
 
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """[K] p-value of each cell's U being above zero."""
+        """[K] p-value of U = 0 in each cell."""
         ...
 
     def gain_p_value(self, gains: np.ndarray) -> float:
-        """p-value of gains [N], one for each row, being above zero."""
+        """One-sided p-value of a zero mean of gains [N], one for each row."""
         ...
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """[R, K] squared residual of K models with common residuals [K, M] in resamples of the rows; draws [R, N]."""
+        """[R, K] squared residual of K models in resamples of the rows.
+
+        Args:
+            commons: [K, M] common residual of each model.
+            draws: [R, N] weights of the rows (`resample_weights`).
+        """
         ...
 
     def largest_score(
@@ -221,8 +234,8 @@ class Resampling(Protocol):
 
         Args:
             scores: [K, N] of each direction and row.
-            sensitivities: [K, M] of the directions, projected.
-            base: [M, D] columns they were projected on.
+            sensitivities: [K, M] projected sensitivities of the directions.
+            base: [M, D] columns of the base parameters, which were projected out.
             prior: [D] prior deviations of these.
             seed: of the flips.
         """
@@ -231,16 +244,17 @@ class Resampling(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Rows are repeats.  deviations: [N, M] of the repeats from their mean, data minus mean.
+    """Rows that are repeats.
 
-    What grows or fades steadily over the repeats is taken out before every test (`statistics.detrended`).
+    deviations: [N, M] of the repeats from their mean.  Their trend over the order of the repeats is removed before
+    every test (`detrended`).
     """
 
     deviations: np.ndarray
 
     @property
     def repeated(self) -> bool:
-        """They are."""
+        """True."""
         return True
 
     @property
@@ -255,15 +269,15 @@ class Repeats:
 
     @property
     def counted(self) -> np.ndarray:
-        """All."""
+        """[M] all of them."""
         return np.ones(self.deviations.shape[1], bool)
 
     def residuals(self, common: np.ndarray) -> np.ndarray:
-        """[N, M] common part and deviations."""
+        """[N, M] common residual plus deviations."""
         return common + self.deviations
 
     def discrepancy(self, residuals: np.ndarray) -> float:
-        """U of what the repeats share."""
+        """U of the common residual, without the noise."""
         return discrepancy(detrended(residuals))
 
     def discrepancies(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -279,36 +293,39 @@ class Repeats:
         return one_sided_p(detrended(gains))
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """[R, K] up to what all models share."""
+        """[R, K] up to a constant that is the same for all models."""
         return np.sum(commons**2, axis=1) + 2 * draws @ (detrended(self.deviations) @ commons.T)
 
     def largest_score(
         self, scores: np.ndarray, sensitivities: np.ndarray, base: np.ndarray, prior: np.ndarray, seed: int = 0
     ) -> tuple[np.ndarray, float]:
-        """Student's t over the repeats; neither the sensitivities nor the base are needed."""
+        """Student's t over the repeats; sensitivities and base are not used."""
         return largest_detrended_t(scores, seed)
 
 
 def in_turns(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """[M] the blocks [M] of some parts as those of one, which take turns."""
+    """[M] block numbers of several parts' blocks [M] together, in order of time if the parts alternate."""
     out = np.full(len(parts[0]), OUTSIDE)
     for number, block in enumerate(parts):
         out = np.where(block == OUTSIDE, out, len(parts) * block + number)
-    kept, within = np.unique(out[out != OUTSIDE], return_inverse=True)
-    assert len(kept)
-    out[out != OUTSIDE] = within
+    numbers, renumbered = np.unique(out[out != OUTSIDE], return_inverse=True)
+    assert len(numbers)
+    out[out != OUTSIDE] = renumbered
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Rows are blocks of one recording of one repeat.  block: [M] of each residual, OUTSIDE for other parts."""
+    """Rows that are blocks of time of one recording of one repeat.
+
+    block: [M] block number of each residual, `OUTSIDE` for residuals of other parts.
+    """
 
     block: np.ndarray
 
     @property
     def repeated(self) -> bool:
-        """They are not."""
+        """False."""
         return False
 
     @property
@@ -318,25 +335,25 @@ class Blocks:
 
     @property
     def size(self) -> int:
-        """Those of the blocks."""
+        """Number of residuals inside the blocks."""
         return int(self.counted.sum())
 
     @property
     def counted(self) -> np.ndarray:
-        """Those of the blocks."""
+        """[M] bool, residuals inside the blocks."""
         return self.block != OUTSIDE
 
     @property
     def _inside(self) -> np.ndarray:
-        """[B, M] which residuals a block holds."""
+        """[B, M] bool, residuals of each block."""
         return self.block == np.arange(self.units)[:, None]
 
     def residuals(self, common: np.ndarray) -> np.ndarray:
-        """[B, M] B times each block's residuals, zero elsewhere: their mean is the whole residual."""
+        """[B, M] B times each block's residuals, zero elsewhere; their mean is the common residual."""
         return self.units * self._inside * common
 
     def discrepancy(self, residuals: np.ndarray) -> float:
-        """Mean square of the residual, noise included, over the blocks' instants."""
+        """Mean square of the residual inside the blocks, noise included."""
         return float(np.mean(residuals.mean(axis=0)[self.counted] ** 2))
 
     def discrepancies(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -345,15 +362,15 @@ class Blocks:
         return inside @ residuals.mean(axis=0) ** 2 / np.maximum(inside.sum(axis=1), 1)
 
     def cell_p_values(self, residuals: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Ones: squares do not change sign, so no flip separates a cell's discrepancy from its noise."""
+        """Ones: squares do not change under sign flips, so noise and discrepancy of a cell cannot be separated."""
         return np.ones(len(cells))
 
     def gain_p_value(self, gains: np.ndarray) -> float:
-        """By flips of blocks.  They follow in time, and what moves more towards one end says nothing of noise."""
+        """By flips of blocks, without detrending: a trend over the blocks comes from the motion."""
         return one_sided_p(gains)
 
     def losses(self, commons: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """[R, K] in resamples of the blocks."""
+        """[R, K] squared residual in resamples of the blocks."""
         return self.units * draws @ (self._inside @ commons.T**2)
 
     def largest_score(
@@ -361,32 +378,32 @@ class Blocks:
     ) -> tuple[np.ndarray, float]:
         """Standardised scores under flips of blocks.
 
-        With H the base's (ridge) projection, a flip F of noise has the score z (1 - H) F (1 - H) e, whose variance
-        is |(1 - H) F z|^2.
+        Let H be the (ridge) projection on the base columns.  A flip F of noise e has the score z (1 - H) F (1 - H) e
+        with the variance |(1 - H) F z|^2.
         """
         flips = sign_flips(self.units, seed)
-        left = self.left_after_flips(sensitivities, base, prior, flips)
-        standardised = flips @ scores.T / self.units / np.sqrt(np.maximum(left, 1e-30))
+        sizes = self.flipped_sizes(sensitivities, base, prior, flips)
+        standardised = flips @ scores.T / self.units / np.sqrt(np.maximum(sizes, 1e-30))
         largest = np.max(np.abs(standardised), axis=1)
         return standardised[0], float(np.mean(largest >= largest[0] * (1 - 1e-12)))
 
-    def left_after_flips(
+    def flipped_sizes(
         self, sensitivities: np.ndarray, base: np.ndarray, prior: np.ndarray, flips: np.ndarray
     ) -> np.ndarray:
-        """[F, K] squared size of each flipped sensitivity after projection, |(1 - H) F z|^2."""
+        """[F, K] squared norm of each sensitivity after flipping and projection, |(1 - H) F z|^2."""
         inverse = np.linalg.inv(base.T @ base + np.diag(prior**-2))
-        taken = np.linalg.cholesky(inverse + inverse @ np.diag(prior**-2) @ inverse)  # of 2 H - H^2
-        shares = np.stack([(sensitivities * inside) @ base @ taken for inside in self._inside])  # [B, K, D]
+        factor = np.linalg.cholesky(inverse + inverse @ np.diag(prior**-2) @ inverse)  # of 2 H - H^2
+        shares = np.stack([(sensitivities * inside) @ base @ factor for inside in self._inside])  # [B, K, D]
         size = np.einsum("km,km->k", sensitivities, sensitivities)
         chunks = np.split(flips, np.arange(CHUNK, len(flips), CHUNK))
-        lost = np.concatenate([np.sum(np.tensordot(some, shares, 1) ** 2, axis=-1) for some in chunks])
-        return np.maximum(size - lost, 1e-9 * size)
+        absorbed = np.concatenate([np.sum(np.tensordot(some, shares, 1) ** 2, axis=-1) for some in chunks])
+        return np.maximum(size - absorbed, 1e-9 * size)
 
 
 def block_length(residuals: np.ndarray, config: BlocksConfig, rate: float = DEFAULT_NOISE.rate) -> float:
-    """s, for residuals [K, C] at `rate` Hz: some correlation times, the median over the columns.
+    """Length of a block [s] for residuals [K, C] at `rate` Hz (`BlocksConfig.correlation_times`).
 
-    Of a model that lacks something the residual holds that too, and is correlated for longer than its noise.
+    The residuals of a model that lacks an effect are correlated for longer than the noise.
     """
     return max(config.shortest, config.correlation_times * float(np.median(correlation_time(residuals, rate))))
 
@@ -400,26 +417,26 @@ def interleaved(
     share: float = 1.0,
     least: int = FEWEST_REPEATS,
 ) -> np.ndarray:
-    """[parts, K] block of each instant, from `first` to `end`, for parts that take turns.
+    """[parts, K] block number of each instant, for parts whose blocks alternate.
 
     Args:
         clock: [K] s.
-        first: s, where the first block begins.
-        end: s, where the last one ends.
-        length: s, of a block at least.
-        parts: that take turns, e.g. training and validation.
-        share: of the recording that `first` to `end` is.
-        least: blocks that each part must have.
+        first: s, beginning of the first block.
+        end: s, end of the last block.
+        length: s, least length of a block.
+        parts: number of parts, e.g. two for training and validation.
+        share: share of the recording between `first` and `end`.
+        least: least number of blocks in each part.
 
     Raises:
-        ValueError: a part would get fewer; it says how long the recording should be.
+        ValueError: a part would get fewer; the message says how long the recording should be.
     """
     each = int((end - first) / length) // parts
     if each < least:
         needed = parts * least * length / share
         raise ValueError(
             f"{end - first:.3g} s hold {each} blocks of {length:.3g} s for each of {parts} parts; "
-            f"{least} are needed to tell an effect from noise: record for {np.ceil(needed):g} s or longer"
+            f"{least} are needed to distinguish an effect from noise: record for {np.ceil(needed):g} s or longer"
         )
     at = np.floor((clock - first) / (end - first) * parts * each).astype(int)
     inside = (clock >= first) & (clock < end)
@@ -427,6 +444,6 @@ def interleaved(
 
 
 def fewest_blocks(clock: np.ndarray, first: float) -> np.ndarray:
-    """[K] block of each instant from `first` on, for what is not tested: as few blocks as there may be."""
+    """[K] block number of each instant from `first` on: as few blocks as allowed, for fits that are not tested."""
     end = clock[-1] + 1e-6
     return interleaved(clock, first, end, (end - first) / (FEWEST_REPEATS + 0.5))[0]

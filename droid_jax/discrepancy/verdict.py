@@ -1,4 +1,4 @@
-"""What the search for missing effects ends with: the answer and its grounds."""
+"""The result of a search for missing effects: the conclusion and its grounds."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import numpy as np
 from droid_jax.discrepancy.candidates import ScoreTest, Trend, trend
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, beyond_step_error, remaining_residuals
+from droid_jax.discrepancy.fitting import FittedModel
 from droid_jax.discrepancy.maps import Localisation, localise
+from droid_jax.discrepancy.posterior import remaining_discrepancy, remaining_residuals
 from droid_jax.discrepancy.selection import Reason, SelectionStep, ValidationTest, doubts
+from droid_jax.discrepancy.step_error import beyond_step_error, more_than_step_error
 from droid_jax.files import LOST
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import EffectKey, Keys, names_of
@@ -22,24 +24,24 @@ Alternatives = tuple[Keys, ...]  # each may be several effects together
 
 
 class Conclusion(enum.Enum):
-    """The answers there are."""
+    """Possible conclusions."""
 
-    NONE = "none"  # nothing is missing that these recordings could tell
-    NAMED = "named"  # these effects are missing
-    INDISTINGUISHABLE = "indistinguishable"  # one of these; an experiment that would tell them apart is named
-    PARTLY = "partly explained"  # these, and a remainder that nothing in the library explains
-    UNEXPLAINED = "unexplained"  # something is missing, and nothing in the library is it
-    UNCONVERGED = "fit not converged"  # of the base model or of the extended one; nothing can be concluded
+    NONE = "none"  # these recordings show no missing effect
+    NAMED = "named"  # the named effects are missing
+    INDISTINGUISHABLE = "indistinguishable"  # one of several effects; experiments that distinguish them are proposed
+    PARTLY = "partly explained"  # the named effects, and a remainder that nothing in the library explains
+    UNEXPLAINED = "unexplained"  # something is missing that is not in the library
+    UNCONVERGED = "fit not converged"  # of the base model or of the model with effects: no conclusion
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Something to record that would distinguish indistinguishable models.
+    """An experiment that would distinguish indistinguishable models.
 
-    what: in words.
-    distance: standardised difference of the models' simulated torques there; above about 6 ten repeats decide.  None
-        where the simulation could not be made.
-    not_made: why.
+    what: description.
+    distance: standardised difference of the models' simulated channels; ten repeats decide above about 6.  None if the
+        simulation failed.
+    not_made: reason of the failure.
     """
 
     what: str
@@ -49,10 +51,10 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Hint:
-    """Effects that passed their tests and close too little to be named: they may only imitate what is missing.
+    """Effects that passed their tests but explain too little to be named: they may imitate what is missing.
 
-    effects, indistinguishable: as of a verdict.
-    closed: share of U beyond the discretisation error by held-out role, "validation" and "test".
+    effects, indistinguishable: as in a verdict.
+    closed: held-out role, "validation" or "test" -> share of U beyond the discretisation error that they explain.
     """
 
     effects: Keys
@@ -60,33 +62,34 @@ class Hint:
     closed: dict[str, float]
 
     def __str__(self) -> str:
-        """ "a (closes 31 %)", "a or b (closes 31 %)": the least that it closes on a held-out recording."""
+        """Text with the smallest share on a held-out recording, e.g. "a or b (closes 31 %)"."""
         each = [_or(e, others) for e, others in zip(self.effects, self.indistinguishable, strict=True)]
         return f"{' and '.join(each)} (closes {max(min(self.closed.values()), 0.0):.0%})"
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The answer and its grounds.
+    """The conclusion of a search and its grounds.
 
-    conclusion: which of the answers.
-    effects: what is in the model; indistinguishable: for each of them the alternatives that do as well.
-    base, model: before and after.
-    discretisation_error: U0, what the simulation's own step leaves.
-    discrepancies: "train", "validation", "test" -> (U before, U after).
-    before, after: where U lives on the training recording.
+    conclusion: see `Conclusion`.
+    effects: effects in the model.
+    indistinguishable: for each of them the alternatives that are indistinguishable from it.
+    base, model: the base model, and the model with the effects.
+    discretisation_error: U0.
+    discrepancies: "train", "validation", "test" -> (U of the base model, U of the model).
+    before, after: U of both models by cell of the training recording.
     config: the thresholds.
     remainder: U on the validation recording that neither `model` nor the uncertainty of its fit explains
-        (`fitting.remaining_residuals`), None where no fit converged.
-    score_tests, validation_tests: the grounds, in the order they were made.
-    failed: models whose replay blew up where their refit was to begin, or on the test recording, which then is not in
-        `discrepancies`.
-    indistinguishable_models: models that do as well as `model`, refitted.
-    experiments: what would distinguish them, the best first.
-    not_tried: what the budget left out, empty for nothing.
-    trend: what changes from repeat to repeat, None where nothing was asked.
-    hints: effects that close too little to be named, see `unnamed`; the model is without them.
-    doubts: what is to be doubted of the effects in the model (`selection.doubts`).
+        (`posterior.remaining_residuals`); None if a fit did not converge.
+    score_tests, validation_tests: all tests, in the order in which they were made.
+    failed: names of models whose replay blew up at the start of their refit, on the validation recording, or on the
+        test recording, which then is not in `discrepancies`.
+    indistinguishable_models: refitted models that are indistinguishable from `model`.
+    experiments: experiments that would distinguish them, the best first.
+    not_tried: fits that were skipped for lack of time, in words.
+    trend: the strongest trend over the repeats; None for logs, or if there was no score test.
+    hints: effects that explain too little to be named (`unnamed`); the model does not have them.
+    doubts: doubts about the effects in the model (`selection.doubts`).
     """
 
     conclusion: Conclusion
@@ -111,12 +114,12 @@ class Verdict:
     doubts: tuple[str, ...] = ()
 
     def closed(self, role: str) -> float:
-        """1 - (U_after - U0) / (U_before - U0) on "train", "validation" or "test"."""
+        """Share of U beyond U0 that the model explains on a role: 1 - (U_after - U0) / (U_before - U0)."""
         before, after = self.discrepancies[role]
         return 1.0 - open_share(after, before, self.discretisation_error)
 
     def closed_held_out(self) -> dict[str, float]:
-        """`closed` of the held-out roles that show a discrepancy at all."""
+        """Held-out role -> `closed`, for roles with a discrepancy beyond the discretisation error."""
         held_out = {role: before for role, (before, _) in self.discrepancies.items() if role != "train"}
         return {
             role: self.closed(role)
@@ -126,21 +129,21 @@ class Verdict:
 
     @property
     def explained(self) -> float:
-        """Share of U on the validation recording that the model, or its fit's uncertainty, explains."""
+        """Share of U on the validation recording that the model, or the uncertainty of its fit, explains."""
         before, after = self.discrepancies["validation"]
-        left = after if self.remainder is None else self.remainder
-        return 1.0 - open_share(left, before, self.discretisation_error)
+        remaining = after if self.remainder is None else self.remainder
+        return 1.0 - open_share(remaining, before, self.discretisation_error)
 
     @property
     def sentence(self) -> str:
-        """The answer in words, and what is to be doubted of it."""
+        """The conclusion and its doubts in words."""
         return "".join([self._answer, *(f" But {doubt}." for doubt in self.doubts)])
 
     @property
     def _answer(self) -> str:
         lacking = f"The model lacks {_lacking(self.effects, self.indistinguishable)}"
         if self.conclusion is Conclusion.NONE:
-            return "Nothing is missing that these recordings could tell."
+            return "Nothing is missing that these recordings could show."
         if self.conclusion is Conclusion.NAMED:
             return f"The model lacks: {_lacking(self.effects, self.indistinguishable)}."
         if self.conclusion is Conclusion.INDISTINGUISHABLE:
@@ -154,15 +157,15 @@ class Verdict:
             )
         if self.conclusion is Conclusion.UNEXPLAINED:
             hints = f" Hints, not names, since they may only imitate it: {'; '.join(map(str, self.hints))}."
-            lost = "".join(f", or {text}" for text in _lost_narrowly(self.validation_tests))
-            return f"The model lacks something that is not in the library{lost}.{hints if self.hints else ''}"
+            rejected = "".join(f", or {text}" for text in _narrowly_rejected(self.validation_tests))
+            return f"The model lacks something that is not in the library{rejected}.{hints if self.hints else ''}"
         which = "the model with the effects" if self.base.refined.converged else "the base model"
         return f"The fit of {which} did not converge; nothing can be concluded."
 
 
-def open_share(left: float, before: float, discretisation_error: float) -> float:
-    """Share of U that is left open: of U before and U left, both above the discretisation error."""
-    return (left - discretisation_error) / max(before - discretisation_error, 1e-12)
+def open_share(remaining: float, before: float, discretisation_error: float) -> float:
+    """Remaining share of U beyond the discretisation error: (U_remaining - U0) / (U_before - U0)."""
+    return (remaining - discretisation_error) / max(before - discretisation_error, 1e-12)
 
 
 def _or(effect: object, alternatives: Alternatives) -> str:
@@ -170,22 +173,22 @@ def _or(effect: object, alternatives: Alternatives) -> str:
 
 
 def _lacking(effects: Keys, indistinguishable: Sequence[Alternatives]) -> str:
-    """ "a and b", "a, and one of: b or c"."""
+    """Effects and their alternatives in words, e.g. "a and b" or "a, and one of: b or c"."""
     both = list(zip(effects, indistinguishable, strict=True))
     certain = " and ".join(str(e) for e, others in both if not others)
     open_ones = [f"one of: {_or(e, others)}" for e, others in both if others]
     return ", and ".join([certain, *open_ones] if certain else open_ones)
 
 
-def _lost_narrowly(tests: Sequence[ValidationTest]) -> list[str]:
-    """Candidates that lost for their size or their significance alone: one of them may be all there is.
+def _narrowly_rejected(tests: Sequence[ValidationTest]) -> list[str]:
+    """Models, in words, that were rejected for their size, a bound or their significance alone.
 
-    A model with all the effects of another one, and more, is not listed beside it.
+    A model that has all effects of another one, and more, is not listed beside it.
     """
 
     def only(reason: Reason) -> list[ValidationTest]:
-        lost = [t for t in tests if t.reasons and all(r.reason is reason for r in t.reasons)]
-        return [t for t in lost if not any({*other.keys} < {*t.keys} for other in lost)]
+        rejected = [t for t in tests if t.reasons and all(r.reason is reason for r in t.reasons)]
+        return [t for t in rejected if not any({*other.keys} < {*t.keys} for other in rejected)]
 
     large = {names_of(t.keys): " and ".join(r.text for r in t.reasons) for t in only(Reason.AT_BOUND)}
     groups = (
@@ -199,15 +202,6 @@ def _lost_narrowly(tests: Sequence[ValidationTest]) -> list[str]:
     return [f"{' or '.join(names)}, {why}" for names, why in groups if names]
 
 
-def more_than_step_error(case: Case, model: FittedModel, found: ScoreTest, discretisation_error: float) -> bool:
-    """Whether what a score test found is more than the time step could leave, U0.
-
-    U of blocks holds their noise too: there it is what the best direction takes of it.
-    """
-    share = 1.0 if case.train.resampling.repeated else float(np.max(found.explained))
-    return beyond_step_error(share * model.discrepancy, discretisation_error)
-
-
 def conclude(
     case: Case,
     base: FittedModel,
@@ -219,34 +213,34 @@ def conclude(
     failed: tuple[str, ...] = (),
     not_tried: tuple[str, ...] = (),
 ) -> Verdict:
-    """The verdict on a base model and a selected one.  Of a fit that did not converge nothing is named.
+    """The verdict on a base model and a selected model.  If one of their fits did not converge, nothing is named.
 
     Args:
         case: the recordings.
         base: the base model.
-        model: the selected one, the base model where none was.
-        steps: of the search.
+        model: the selected model; the base model if none was selected.
+        steps: steps of the search.
         discretisation_error: U0.
         exhausted: whether the last score test found nothing more.
-        failed: models whose replay blew up.
-        not_tried: what the budget left out.
+        failed: names of models whose replay blew up.
+        not_tried: fits that were skipped for lack of time.
     """
     config = case.config.selection
     converged = base.refined.converged and model.refined.converged
     if not converged:
         model, steps = base, [replace(step, selected=None, chosen=None) for step in steps]
-    discrepancies, lost = _discrepancies(case, base, model)
+    discrepancies, failed_on_test = _discrepancies(case, base, model)
     missing = bool(steps) and steps[0].score_test.p < config.significance
     missing = missing and more_than_step_error(case, base, steps[0].score_test, discretisation_error)
     alternatives = tuple(_alternatives(part.key, model, steps) for part in model.parts)
-    left = remaining_residuals(case.train, case.validation, model) if converged else None
+    residuals = remaining_residuals(case.train, case.validation, model) if converged else None
     conclusion = Conclusion.UNEXPLAINED if missing else Conclusion.NONE
-    if left is None:
+    if residuals is None:
         conclusion = Conclusion.UNCONVERGED
     elif model.parts:
         conclusion = Conclusion.INDISTINGUISHABLE if any(alternatives) else Conclusion.NAMED
         before = discrepancies["validation"][0]
-        if _remains(case, left, before, discretisation_error, exhausted):
+        if _remains(case, residuals, before, discretisation_error, exhausted):
             conclusion = Conclusion.PARTLY
     first = steps[0].score_test if steps else None
     repeated = case.train.resampling.repeated
@@ -258,35 +252,37 @@ def conclude(
         model=model,
         discretisation_error=discretisation_error,
         discrepancies=discrepancies,
-        remainder=None if left is None else case.validation.resampling.discrepancy(left),
+        remainder=None if residuals is None else case.validation.resampling.discrepancy(residuals),
         score_tests=tuple(dict.fromkeys(step.score_test for step in steps)),  # pairs are proposed from the first one
         validation_tests=tuple(t for step in steps for t in step.tests),
         before=localise(case.train, base.values, base.residuals, model.values),
         after=localise(case.train, model.values, model.residuals, model.values),
         config=config,
-        failed=(*failed, *lost),
+        failed=(*failed, *failed_on_test),
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
-        doubts=(*doubts(case.train, model, case.natural_bounds), *worsened(discrepancies, model, config)),
+        doubts=(
+            *doubts(case.train, model, case.natural_bounds),
+            *worsened(discrepancies, model, discretisation_error, config),
+        ),
     )
     return unnamed(case, verdict) if closes_too_little(verdict) else verdict
 
 
 def closes_too_little(verdict: Verdict) -> bool:
-    """Whether effects beside a remainder close less than `minimum_closed` on a held-out recording.
+    """Whether effects with an unexplained remainder explain less than `minimum_closed` on a held-out recording.
 
-    What closes a third of a discrepancy and leaves the rest may only imitate what is missing.
+    An effect that explains a third of a discrepancy may only imitate what is missing.
     """
     closed = verdict.closed_held_out() if verdict.conclusion is Conclusion.PARTLY else {}
     return bool(closed) and min(closed.values()) < verdict.config.minimum_closed
 
 
 def unnamed(case: Case, verdict: Verdict) -> Verdict:
-    """The verdict with its effects as hints, and the base model as the one that stands."""
+    """The verdict with its effects as hints, and the base model as its model."""
     base = verdict.base
-    where = localise(case.train, base.values, base.residuals, base.values)
-    left = remaining_residuals(case.train, case.validation, base)
+    cells = localise(case.train, base.values, base.residuals, base.values)
     return replace(
         verdict,
         conclusion=Conclusion.UNEXPLAINED,
@@ -294,9 +290,9 @@ def unnamed(case: Case, verdict: Verdict) -> Verdict:
         indistinguishable=(),
         model=base,
         discrepancies={role: (before, before) for role, (before, _) in verdict.discrepancies.items()},
-        remainder=case.validation.resampling.discrepancy(left),
-        before=where,
-        after=where,
+        remainder=remaining_discrepancy(case.train, case.validation, base),
+        before=cells,
+        after=cells,
         indistinguishable_models=(),
         doubts=(),
         hints=(Hint(verdict.effects, verdict.indistinguishable, verdict.closed_held_out()),),
@@ -306,34 +302,40 @@ def unnamed(case: Case, verdict: Verdict) -> Verdict:
 def _discrepancies(
     case: Case, base: FittedModel, model: FittedModel
 ) -> tuple[dict[str, tuple[float, float]], tuple[str, ...]]:
-    """U before and after by role; without the test recording, and with a note, where one cannot be replayed there."""
-    found = {}
-    for role, judged in case.residual_sets.items():
+    """Role -> U of both models, and notes.  If a replay of the test recording blows up, that role is left out."""
+    discrepancies = {}
+    for role, residual_set in case.residual_sets.items():
         try:
-            found[role] = judged.discrepancy_at(base.values), judged.discrepancy_at(model.values)
+            discrepancies[role] = residual_set.discrepancy_at(base.values), residual_set.discrepancy_at(model.values)
         except NotReplayed:
             if role != "test":
                 raise
-            return found, (LOST,)
-    return found, ()
+            return discrepancies, (LOST,)
+    return discrepancies, ()
 
 
 def worsened(
-    discrepancies: Mapping[str, tuple[float, float]], model: FittedModel, config: SelectionConfig
+    discrepancies: Mapping[str, tuple[float, float]],
+    model: FittedModel,
+    discretisation_error: float,
+    config: SelectionConfig,
 ) -> tuple[str, ...]:
-    """A doubt where the test recording is matched clearly worse with the effects than without, by the share that a
-    first effect has to gain: they do not carry over to it.
+    """A doubt if the effects increase U on the test recording by more than `SelectionConfig.least_gain`.
+
+    There is none if U with the effects is within the error of the time step.
     """
     before, after = discrepancies.get("test", (0.0, 0.0))
     if not model.parts or after <= (1 + config.least_gain) * max(before, 0.0):
+        return ()
+    if not beyond_step_error(after, discretisation_error):
         return ()
     return (f"the test recording is matched worse with it, U {before:.3g} before and {after:.3g} after",)
 
 
 def _remains(case: Case, residuals: np.ndarray, before: float, discretisation_error: float, exhausted: bool) -> bool:
-    """Whether residuals of the validation recording hold much of its U, and more than chance leaves.
+    """Whether the remaining residuals of the validation recording show a large and significant part of its U.
 
-    An effect that no candidate looks like is seen by no score test, but by every repeat.
+    A score test cannot detect an effect that resembles no candidate; the repeats can.
     """
     rows, config = case.validation.resampling, case.config.selection
     if open_share(rows.discrepancy(residuals), before, discretisation_error) <= config.open_share:
@@ -343,15 +345,16 @@ def _remains(case: Case, residuals: np.ndarray, before: float, discretisation_er
 
 
 def _alternatives(part: EffectKey, model: FittedModel, steps: Sequence[SelectionStep]) -> Alternatives:
-    """What is equivalent to one effect of the model: what others have in its place in the last step that selected it.
+    """Alternatives to one effect: the effects in its place in models indistinguishable from the one that was selected.
 
-    An alternative that does without several of the model's effects is named whole, beside each of them.
+    They are those of the last step that selected the effect.  An alternative that replaces several effects of the model
+    is listed for each of them.
     """
-    known = set(model.keys)
+    present = set(model.keys)
     for done in reversed(steps):
         added = set(done.selected.keys) - set(done.before) if done.selected is not None else set()
         if part in added:
             others = [set(m.keys) - set(done.before) for m in done.indistinguishable]
-            instead = {tuple(sorted(o - added)) for o in others if part not in o and not (o - added) & known}
+            instead = {tuple(sorted(o - added)) for o in others if part not in o and not (o - added) & present}
             return tuple(sorted(keys for keys in instead if keys))
     return ()

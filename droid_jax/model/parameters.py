@@ -352,6 +352,11 @@ class Space:
         out[:, self.columns(part)] = np.asarray(rows)
         return out
 
+    def unknown_names(self, known: Mapping[str, float | str]) -> list[str]:
+        """Names in what a recording states (`Recording.known`) that are no parameters of this space, sorted."""
+        names = {*known, *(value for value in known.values() if isinstance(value, str))}
+        return sorted(names - {*self.names})
+
     def with_known(self, known: Mapping[str, float | str], values: Any) -> Any:
         """Vectors [..., D] in which known values replace those of some parameters.
 
@@ -364,13 +369,13 @@ class Space:
         """
         if not known:
             return values
+        if unknown := self.unknown_names(known):
+            raise ValueError(
+                f"a recording states {', '.join(unknown)} (known), which is no parameter here: list it, give the "
+                "effect that has it (--effects), or convert without --known; there are: " + ", ".join(self.names)
+            )
         out = np.array(values)
         for parameter, value in known.items():
-            if unknown := [n for n in (parameter, value) if isinstance(n, str) and n not in self._index]:
-                raise ValueError(
-                    f"a recording states {', '.join(unknown)} (known), which is no parameter here: list it, give the "
-                    "effect that has it (--effects), or convert without --known; there are: " + ", ".join(self.names)
-                )
             p = self[parameter]
             if isinstance(value, str):
                 out[..., self.index(parameter)] = np.asarray(values)[..., self.index(value)]

@@ -19,9 +19,9 @@ import numpy as np
 from droid_jax.cost.cost import without_unused
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import with_finer_step
 from droid_jax.discrepancy.log_case import case_of
 from droid_jax.discrepancy.missing import search
+from droid_jax.discrepancy.step_error import with_finer_step
 from droid_jax.errors import reason
 from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
 from droid_jax.model.effect_interface import Effect

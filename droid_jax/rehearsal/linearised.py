@@ -17,10 +17,12 @@ from droid_jax.cost.channels import SIMULATED
 from droid_jax.cost.cost import Cost, make_cost, without_unused
 from droid_jax.cost.windowed_log import WindowedLog
 from droid_jax.discrepancy.candidates import ScoreDirection, directions_of, project, scored, sensitivities
-from droid_jax.discrepancy.case import Case, ResidualSet, comparing
+from droid_jax.discrepancy.case import AnyCost, Case, ResidualSet, comparing
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, model_at, until, with_finer_step, with_step_difference
-from droid_jax.discrepancy.log_case import base_model, case_of, least_residual, refitted_residual
+from droid_jax.discrepancy.fitting import FittedModel, base_model, model_at
+from droid_jax.discrepancy.log_case import case_of
+from droid_jax.discrepancy.log_noise import least_residual, refitted_residual
+from droid_jax.discrepancy.step_error import until, with_finer_step, with_step_difference
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import candidates
@@ -188,7 +190,7 @@ def fine_steps(
         divisors: two increasing divisors of the time step.
     """
 
-    def difference(finer: Cost | None) -> np.ndarray | None:
+    def difference(finer: AnyCost | None) -> np.ndarray | None:
         return with_step_difference(residual_set, model, finer).step_difference
 
     cost, costs = residual_set.cost, list[Cost]()

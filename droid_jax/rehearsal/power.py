@@ -14,8 +14,8 @@ import numpy as np
 import scipy.stats
 
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import WORST
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
+from droid_jax.discrepancy.step_error import FIRST_ORDER_RATIO
 from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, Unabsorbed, unabsorbed, weak_imitation_limit
 
 HALVINGS = 8  # of the range of noncentralities, in logarithms
@@ -113,7 +113,7 @@ def discrepancy_crossings(model: LinearModel, k: int, part: Unabsorbed, config: 
         return np.zeros(config.draws)
     rng, step_error, out = np.random.default_rng([config.seed, 3, k]), model.step_error, np.zeros(config.draws)
     recordings: tuple[tuple[Literal["train", "validation"], float, float], ...] = (
-        ("train", WORST, model.repeats),
+        ("train", FIRST_ORDER_RATIO, model.repeats),
         ("validation", 1.0, model.judging_repeats),
     )
     for name, factor, count in recordings:
@@ -280,7 +280,7 @@ def _of_blocks(
     """The score test of blocks, whose scores are linear in an effect's size; arguments as in `_of_repeats`."""
     count, prior = rows.units, model.prior * model.slack
     flips = _some_flips(count, config)
-    squares = rows.left_after_flips(unit, model.tested.base, prior, flips)  # [F, K]
+    squares = rows.flipped_sizes(unit, model.tested.base, prior, flips)  # [F, K]
     members = [np.flatnonzero(rows.block == b) for b in range(count)]
     drawn = model.tested.noise(config.draws, rng)
 

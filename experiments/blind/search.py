@@ -16,15 +16,10 @@ from benchmarks.common import CODE
 from benchmarks.sharing import claimed
 from droid_jax.cost.cost import Cost
 from droid_jax.discrepancy.case import Case, ResidualSet, make_case, residual_set
-from droid_jax.discrepancy.fitting import (
-    FittedModel,
-    base_fit,
-    discretisation_error,
-    intervals,
-    with_finer_step,
-    with_step_difference,
-)
+from droid_jax.discrepancy.fitting import FittedModel, base_fit
+from droid_jax.discrepancy.posterior import intervals
 from droid_jax.discrepancy.search import search_effects
+from droid_jax.discrepancy.step_error import discretisation_error, with_finer_step, with_step_difference
 from droid_jax.discrepancy.verdict import Verdict
 from droid_jax.model.effects.candidate import names_of
 from droid_jax.recordings.formats import load_recording

@@ -32,15 +32,15 @@ def demonstration():
 
 
 def model(name: str, value: float) -> FittedModel:
-    """The base fit with one effect beside it."""
+    """The base model with one effect of a given size."""
     found = small()
     values = found.base.values.copy()
     values[found.case.full_space.index(name)] = value
     return replace(found.base, values=values)
 
 
-def test_a_drag_is_distinguished_from_a_preload_by_another_speed(demonstration, monkeypatch):
-    """Models that differ in a speed-dependent torque: three times slower they come closer, twice as fast they part."""
+def test_another_speed_distinguishes_drag_from_a_preload(demonstration, monkeypatch):
+    """The models differ in a torque that grows with speed, so their distance does too."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:2])
     models = (model("drag", 0.0), model("drag", 0.8))
     found = {e.what: e.distance or 0.0 for e in separating_experiments(small().case, models, demonstration)}
@@ -50,8 +50,8 @@ def test_a_drag_is_distinguished_from_a_preload_by_another_speed(demonstration, 
     assert slower < weighed < faster
 
 
-def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstration, monkeypatch):
-    """The search is done by then.  Those that can be made come first."""
+def test_an_experiment_that_fails_states_the_reason_and_does_not_end_the_search(demonstration, monkeypatch):
+    """Experiments that can be simulated come first."""
     make, raised = missing.make_cost, [TooLong("needs 9.0 GB"), RuntimeError("RESOURCE_EXHAUSTED\nout of memory")]
 
     def short_of_memory(scene, space, recordings, **options):
@@ -70,7 +70,7 @@ def test_an_experiment_that_cannot_be_made_says_why_and_ends_nothing(demonstrati
 
 
 def dropped(recording: Recording, seconds: float) -> Recording:
-    """A recording whose torque sensor gave nothing for a while, in all repeats."""
+    """A recording with a dropout of the torque sensor in all repeats."""
     channel = recording.channels["torque"]
     mask = channel.mask.copy()
     mask[:, (channel.time > 1.0) & (channel.time < 1.0 + seconds)] = False
@@ -78,8 +78,8 @@ def dropped(recording: Recording, seconds: float) -> Recording:
 
 
 @pytest.mark.slow
-def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
-    """60 ms without torques are filled in; three times slower they are too long."""
+def test_a_dropout_that_is_too_long_in_a_slower_motion_is_reported(demonstration):
+    """A gap of 60 ms is interpolated; three times slower it is too long for that."""
     models = (model("drag", 0.0), model("drag", 0.8))
     found = {e.what: e for e in separating_experiments(small().case, models, dropped(demonstration, 0.06))}
     slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
@@ -87,8 +87,8 @@ def test_a_dropout_that_a_slower_motion_makes_too_long_is_said(demonstration):
     assert faster.distance is not None and faster.distance > 0.0
 
 
-def test_a_known_weight_distinguishes_only_what_acts_through_it(demonstration, monkeypatch):
-    """Two payloads differ by as much with a weight beside them as without; two preloads likewise."""
+def test_a_known_weight_does_not_distinguish_payloads_or_preloads(demonstration, monkeypatch):
+    """The distance of two payloads, and of two preloads, is the same with and without the weight."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     case = small().case
     models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
@@ -99,13 +99,13 @@ def test_a_known_weight_distinguishes_only_what_acts_through_it(demonstration, m
 
 
 def gripping(case: Case) -> Case:
-    """The small scene as if its hand, which holds nothing, gripped by contact."""
+    """The small scene with a grip by contact, although its hand holds nothing."""
     cost = replace(case.train.cost, scene=replace(case.train.cost.scene, grip=Grip(())))
     return replace(case, train=replace(case.train, cost=cost))
 
 
-def test_in_the_air_only_the_robot_counts_and_a_hand_that_gets_no_further_is_said(demonstration, monkeypatch):
-    """Two payloads part without the held thing, and as in the plain model: the small scene's hand holds nothing."""
+def test_in_the_air_the_object_has_no_part_and_a_hand_that_reaches_no_further_is_reported(demonstration, monkeypatch):
+    """The distance of two payloads is that of the unchanged scene, since the small scene's hand holds nothing."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     monkeypatch.setattr(missing, "opened_further", lambda *arguments: None)
     case = small().case
@@ -118,8 +118,8 @@ def test_in_the_air_only_the_robot_counts_and_a_hand_that_gets_no_further_is_sai
 
 
 @pytest.mark.slow
-def test_a_motion_within_reach_is_an_experiment(demonstration, monkeypatch):
-    """Where the hand could go on, what the models do on that motion counts (here the same motion again)."""
+def test_a_motion_opened_further_is_an_experiment(demonstration, monkeypatch):
+    """Its distance is that of the models on the longer motion (here the same motion again)."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     monkeypatch.setattr(missing, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
@@ -131,7 +131,7 @@ def test_a_motion_within_reach_is_an_experiment(demonstration, monkeypatch):
 
 
 def test_an_untouched_scene_has_no_contact():
-    """The C engine: fingers closed on the knob press and pull with contacts, and pass through it without."""
+    """In the C engine closed fingers press on the knob with contacts, and pass through it without."""
     scene, plan = door_scene(springs=1), PLANS["A"]
     alone = untouched(scene)
     assert alone.grip is None and scene.grip is not None
@@ -145,7 +145,7 @@ def test_an_untouched_scene_has_no_contact():
 
 
 def weighed(case: Case, whitened: Callable[[np.ndarray], np.ndarray], failed: bool = False) -> Case:
-    """The case with a cost that is known, for the experiment with a weight, which needs no other."""
+    """The case with a given cost, for the experiment with a weight, which needs no other."""
     cost: Any = SimpleNamespace(
         scene=case.train.cost.scene, space=case.full_space, comparisons=case.train.cost.comparisons,
         whitened=whitened, failed=lambda rows: np.array([failed, *[False] * (len(rows) - 1)]),
@@ -153,8 +153,8 @@ def weighed(case: Case, whitened: Callable[[np.ndarray], np.ndarray], failed: bo
     return replace(case, train=replace(case.train, cost=cost))
 
 
-def test_an_experiment_is_as_good_as_what_it_distinguishes_least(demonstration, monkeypatch):
-    """Of three models the two that are nearest to each other count."""
+def test_the_distance_is_that_of_the_two_nearest_models(demonstration, monkeypatch):
+    """Three models."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     case, at = small().case, {0.0: 0.0, 0.1: 1.0, 0.2: 6.0}
     column = case.full_space.index("drag")
@@ -164,15 +164,15 @@ def test_an_experiment_is_as_good_as_what_it_distinguishes_least(demonstration, 
     assert (found.distance, found.not_made) == (1.0, "")
 
 
-def test_a_model_that_fails_on_an_experiment_makes_none_of_it(demonstration, monkeypatch):
-    """Its distance would be no number."""
+def test_an_experiment_on_which_a_model_fails_has_no_distance(demonstration, monkeypatch):
+    """Its distance would be NaN."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     known = weighed(small().case, lambda rows: pytest.fail("one of the models fails"), failed=True)
     (found,) = separating_experiments(known, (model("drag", 0.0), model("drag", 0.1)), demonstration)
     assert found.distance is None and "fails on this motion" in found.not_made
 
 
-def test_a_log_without_commands_cannot_be_asked_for_again(demonstration):
+def test_a_log_without_commands_has_no_experiments(demonstration):
     log = replace(demonstration, command=np.zeros((0, 0)), command_names=())
     assert separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), log) == ()
 

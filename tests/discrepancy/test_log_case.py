@@ -1,4 +1,4 @@
-"""A search in one log without repeats, or in two: blocks of time train and validate in turns."""
+"""A search in one or two logs without repeats, whose blocks of time train and validate in turns."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ import pytest
 from small_log import ASKED, CONFIG, COULOMB, MJCF, NOISE, elbow, elbow_log, elbow_space
 
 from droid_jax.cost.lone_log import LoneLog
-from droid_jax.discrepancy import log_case
+from droid_jax.discrepancy import log_noise
 from droid_jax.discrepancy.candidates import directions_of, score_test
 from droid_jax.discrepancy.case import ResidualSet, block_residual_set, make_case
 from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import at_values
-from droid_jax.discrepancy.log_case import base_model, make_log, noise_left, refitted_residual, single_case
+from droid_jax.discrepancy.fitting import at_values, base_model
+from droid_jax.discrepancy.log_case import make_log, single_case
+from droid_jax.discrepancy.log_noise import noise_residual, refitted_residual
 from droid_jax.discrepancy.search import search_effects
 from droid_jax.discrepancy.statistics import Blocks
 from droid_jax.discrepancy.verdict import Conclusion
@@ -69,7 +70,7 @@ def test_nothing_is_named_where_nothing_is_missing(log: LoneLog):
 
 
 def elbow_torque(log: LoneLog) -> np.ndarray:
-    """[K, 1] what the log would hold without its dry friction."""
+    """[K, 1] torques of the log without its dry friction."""
     values = np.stack([log.space.mean, log.space.values({"joint_coulomb[elbow]": COULOMB})])
     without, with_it = log.simulated(values)
     return log.measured - (with_it - without)
@@ -77,7 +78,7 @@ def elbow_torque(log: LoneLog) -> np.ndarray:
 
 @pytest.mark.slow
 def test_each_joint_of_a_test_log_has_its_own_noise():
-    """Whatever the order of its columns."""
+    """In any order of its columns."""
     scene = two_joints()
     base = Space(tuple(joint_damping(scene, joint, std=0.4, high=10.0) for joint in scene.joints))
     effects = library(scene, ["joint_coulomb"])
@@ -96,19 +97,21 @@ def test_each_joint_of_a_test_log_has_its_own_noise():
     assert deviations(case.train)[1] > 1.5 * deviations(case.train)[0]
 
 
-def test_noise_is_what_candidates_leave_in_the_columns_that_they_explain():
-    """The noise of one sensor does not hide that another's residual is explained."""
+def test_noise_is_the_residual_of_candidates_in_columns_that_they_explain():
+    """The noise of one sensor does not hide an effect in another column."""
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(200, 2)) * [1.0, 0.1]
     whole = noise + np.sin(np.linspace(0.0, 9.0, 200))[:, None] * [0.0, 1.0]
-    left = noise_left(whole, noise, 0.2)
+    left = noise_residual(whole, noise, 0.2)
     assert np.array_equal(left, noise)
-    assert np.array_equal(noise_left(whole, 0.5 * whole, 0.2), whole)
+    assert np.array_equal(noise_residual(whole, 0.5 * whole, 0.2), whole)
 
 
 @pytest.mark.parametrize(("size", "fitted"), [(1.0, True), (0.3, False)])  # of the effect; noise is 1
-def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.MonkeyPatch, size: float, fitted: bool):
-    """Of six columns it takes a ninth of all, and half of one."""
+def test_a_candidate_that_explains_much_of_a_column_is_refitted(
+    monkeypatch: pytest.MonkeyPatch, size: float, fitted: bool
+):
+    """It explains a ninth of six columns, and half of one of them."""
     columns, count, rng = 6, 500, np.random.default_rng(1)
     mark = np.zeros((columns, count))
     mark[4] = np.sqrt(2) * np.sin(np.linspace(0, 60, count))
@@ -129,8 +132,8 @@ def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.Mon
         asked.append(parts)
         return SimpleNamespace(residuals=np.tile(left - size * mark.ravel(), (3, 1)))
 
-    monkeypatch.setattr(log_case, "proposals", lambda *given: [other, best])
-    monkeypatch.setattr(log_case, "refit", refit)
+    monkeypatch.setattr(log_noise, "proposals", lambda *given: [other, best])
+    monkeypatch.setattr(log_noise, "refit", refit)
     case: Any = SimpleNamespace(train=None, base=None, full_space=None, config=DiscrepancyConfig())
     model: Any = SimpleNamespace(residuals=np.tile(left, (3, 1)), values=np.zeros(2))
     got = refitted_residual(case, model, found, columns)
@@ -139,7 +142,7 @@ def test_what_takes_much_of_one_column_is_fitted_in_full(monkeypatch: pytest.Mon
 
 
 def two_joints() -> Scene:
-    """The elbow, and a wrist like it beside it."""
+    """The elbow, and a wrist like it."""
     elbow_body = MJCF[MJCF.index("<body") : MJCF.index("</body>") + len("</body>")]
     wrist_body = elbow_body.replace("forearm", "hand").replace("elbow", "wrist")
     both = MJCF.replace("</worldbody>", f"{wrist_body}</worldbody>")
@@ -166,7 +169,7 @@ def _stacked(columns: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def offset_by(recording: Recording, torque: float, name: str) -> Recording:
-    """A recording whose torque sensor shows so much more at rest."""
+    """A recording with a torque offset [N m]."""
     channel = recording.channel("torque")
     shifted = replace(channel, values=channel.values + torque)
     return replace(recording, name=name, channels={**recording.channels, "torque": shifted})
@@ -174,11 +177,8 @@ def offset_by(recording: Recording, torque: float, name: str) -> Recording:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("off", [0.0, 0.4, 3.0])
-def test_a_test_log_has_torque_offsets_of_its_own(off: float):
-    """Zeroed on another day, by 0 to 10 deviations of the offset's prior: the test data then show no more than noise.
-
-    As on recordings with repeats, however far off it is; the model that explains the rest stays as it is.
-    """
+def test_torque_offsets_of_a_test_log_are_fitted_to_it(off: float):
+    """U of the test data is that of noise for offsets of 0 to 10 prior deviations, as for recordings with repeats."""
     scene = elbow()
     damping, offset = elbow_space(scene).parameters
     base = Space((damping, replace(offset, nuisance=True)))
@@ -199,7 +199,7 @@ def test_a_test_log_has_torque_offsets_of_its_own(off: float):
         assert replace(case.test, nuisances=(), nuisance_columns=None).discrepancy_at(truth) > 2.0 * least
 
 
-def test_repeats_need_no_blocks():
+def test_repeats_are_refused_as_blocks():
     scene = elbow()
     with pytest.raises(ValueError, match="'elbow' has 2 repeats, and a log in blocks has one"):
         make_log(scene, elbow_space(scene), library(scene, ASKED), elbow_log(COULOMB, 8.0, 2), CONFIG)

@@ -1,4 +1,4 @@
-"""Where it disagrees: three parts of a discrepancy of the hinge, and cells over the state of the motion."""
+"""Maps of the discrepancy: three parts along and across the hinge, and cells over the state of the motion."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ CLOCK = np.linspace(0.0, 1.0, INSTANTS)
 
 @pytest.fixture(scope="module")
 def unit() -> np.ndarray:
-    """[C, K] direction in which the hinge shows, which turns with the motion."""
+    """[C, K] direction of a hinge torque in the measured joints, which changes with the motion."""
     drawn = np.random.default_rng(0).normal(size=(COLUMNS, 1)) + 0.5 * np.sin(np.arange(INSTANTS) / 9.0)
     return drawn / np.linalg.norm(drawn, axis=0)
 
 
 def residual_set(common: Callable[[np.ndarray], np.ndarray], object_joint: str = "hinge") -> Any:
-    """Of three joints that stand still, whose residuals are known."""
+    """Residual set of three joints at rest with known residuals."""
     path = np.zeros((1, INSTANTS, COLUMNS))
     rollout = SimpleNamespace(object_angle=np.zeros((1, INSTANTS)), position=path, velocity=path, torque=path)
     channel = SimpleNamespace(name="torque", columns=np.arange(COLUMNS))
@@ -54,13 +54,13 @@ def residual_set(common: Callable[[np.ndarray], np.ndarray], object_joint: str =
 
 @pytest.fixture(scope="module")
 def pushed(unit: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """[P, D] -> [P, M]: a preload shows along the hinge while the door is held."""
+    """[P, D] -> [P, M]: a preload acts along the hinge while the door is held."""
     size = np.where(np.arange(INSTANTS) < FREE, 0.0, 7.0)
     return lambda values: -values[:, 1:] * (unit * size).ravel()
 
 
 def residuals(shared: np.ndarray) -> np.ndarray:
-    """[N, M] of repeats that all hold `shared` [C, K], and noise of one."""
+    """[N, M] residuals of repeats with a common part `shared` [C, K] and noise of one."""
     return shared.ravel() + np.random.default_rng(1).normal(size=(REPEATS, shared.size))
 
 
@@ -76,7 +76,7 @@ def hinge_parts(of: Any, shared: np.ndarray, values: np.ndarray = SPACE.mean) ->
     ("where", "label"),
     [("along", "along the hinge"), ("across", "door held, other directions"), ("free", "door not held")],
 )
-def test_each_part_holds_what_was_put_there(
+def test_each_part_holds_the_discrepancy_that_was_put_there(
     pushed: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, where: str, label: str
 ) -> None:
     held = np.arange(INSTANTS) >= FREE
@@ -92,14 +92,14 @@ def test_each_part_holds_what_was_put_there(
         assert cell.discrepancy == pytest.approx(4.0 / degrees if cell.found else 0.0, abs=0.25)
 
 
-def test_the_parts_are_there_where_a_preload_stands_near_its_bound(pushed: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Its push goes the other way there: beyond the bound nothing may be replayed."""
+def test_the_parts_are_computed_for_a_preload_near_its_bound(pushed: Callable[[np.ndarray], np.ndarray]) -> None:
+    """The step is taken away from the bound, which no replay may cross."""
     checked = residual_set(lambda values: pushed(SPACE.check(values)))
     for preload in (4.9, -4.9):
         assert len(hinge_parts(checked, NOTHING, SPACE.values({"hinge_preload": preload}))) == 3
 
 
-def test_a_hinge_with_a_sensor_of_its_own_needs_no_parts(pushed: Callable[[np.ndarray], np.ndarray]) -> None:
+def test_a_hinge_with_a_sensor_has_no_parts(pushed: Callable[[np.ndarray], np.ndarray]) -> None:
     assert hinge_parts(residual_set(pushed, object_joint="c"), NOTHING) == ()
 
 
@@ -133,7 +133,7 @@ def keys(of: Any, rows: np.ndarray) -> list[CellKey]:
 
 
 def test_a_cell_has_the_unit_of_its_joints_type() -> None:
-    """Whatever unit the whole channel states: an arm of hinges and slides, and a drawer."""
+    """Not that of the whole channel: an arm of hinges and slides, and a drawer."""
     made, rows = moving(np.linspace(0.0, 1.0, 40))
     units = {(k.axis, k.joint): k.unit for k in keys(made, rows)}
     assert (units[Axis.POSITION, "pan"], units[Axis.LOAD, "pan"]) == ("rad", "N m")
@@ -144,8 +144,8 @@ def test_a_cell_has_the_unit_of_its_joints_type() -> None:
     assert (scene.torque_unit(["pan"]), scene.torque_unit(scene.joints)) == ("N m", "N m or N")
 
 
-def test_ranges_cover_a_joint_and_nothing_else() -> None:
-    """Six equal ranges from the least value to the largest; none of what stands still, but for rounding."""
+def test_ranges_cover_the_motion_of_a_joint() -> None:
+    """Six equal ranges from the smallest value to the largest; none for a joint at rest up to rounding."""
     made, rows = moving(np.linspace(-1.0, 2.0, 60))
     found = [k for k in keys(made, rows) if (k.axis, k.joint) == (Axis.POSITION, "pan")]
     assert len(found) == 6 and found[0].low == -1.0
@@ -160,8 +160,8 @@ def test_ranges_cover_a_joint_and_nothing_else() -> None:
     assert not {k.axis for k in keys(shut, rows)} & {Axis.OBJECT_ANGLE, Axis.OBJECT_SPEED, Axis.OBJECT_DIRECTION}
 
 
-def test_a_cell_holds_the_residuals_of_its_range_alone() -> None:
-    """What is shared while the pan is between 0.5 and 1 rad is in that cell, of that joint, at its mean square."""
+def test_a_cell_holds_the_residuals_of_its_range() -> None:
+    """A common residual while the pan is between 0.5 and 1 rad is in that cell, with its mean square."""
     path = np.linspace(-1.0, 2.0, 300)
     made, rows = moving(path)
     here = (path >= 0.5) & (path < 1.0)

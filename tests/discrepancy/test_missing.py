@@ -1,4 +1,4 @@
-"""The search as one call, and what is added to its verdict."""
+"""The search as one call, and the amendments of its verdict."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_hidden_friction_is_named_and_in_the_extended_model(
     assert ("search" in stages) is searched and {"score_test", "refit", "verdict"} <= set(stages)
 
 
-def test_a_log_without_commands_has_no_servo_to_ask_about():
-    """Nor gains of one, which are numbers of the model and change nothing there; laws that read them are kept."""
+def test_servo_effects_are_not_tested_in_a_log_without_commands():
+    """Nor are gains, which are fields of the model without influence there; effects that read them are tested."""
     servo = '</worldbody><actuator><position name="servo" joint="elbow" kp="10"/></actuator>'
     scene = compile_scene(mujoco.MjSpec.from_string(MJCF.replace("</worldbody>", servo)), "elbow", joints=["elbow"])
     log = elbow_log(COULOMB)
@@ -85,7 +85,7 @@ def test_a_log_without_commands_has_no_servo_to_ask_about():
 
 
 @pytest.mark.slow
-def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.MonkeyPatch):
+def test_the_default_effects_are_all_that_can_change_the_compared_channels(monkeypatch: pytest.MonkeyPatch):
     scene, begin = elbow(), np.array([0.6, 0.1])
 
     def answer(split, case, fine, start, progress):
@@ -103,8 +103,8 @@ def test_unless_told_it_asks_about_all_that_could_show(monkeypatch: pytest.Monke
         dj.find_missing_effects(scene, elbow_space(scene), THREE, start=begin)
 
 
-def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
-    """A body called payload has a payload_mass; so has the library."""
+def test_a_parameter_with_the_name_of_an_effects_parameter_is_refused():
+    """The mass of a body named payload and a parameter of the library are both called payload_mass."""
     scene = elbow()
     space = elbow_space(scene)
     taken = Space((*space.parameters[1:], replace(space.parameters[0], name="payload_mass[elbow]")))
@@ -129,14 +129,14 @@ def test_a_name_that_an_effect_has_is_refused_with_what_to_do():
         ({"start": np.zeros(3)}, "expected parameter vectors [..., 2]"),
     ],
 )
-def test_what_could_not_end_well_is_refused_first(changes: dict[str, Any], said: str):
+def test_invalid_arguments_are_refused_before_the_search(changes: dict[str, Any], said: str):
     scene = elbow()
     with pytest.raises(ValueError) as refused:
         dj.find_missing_effects(scene, elbow_space(scene), **{"recordings": [elbow_log(0.0, 2.0, 16)], **changes})
     assert said in str(refused.value)
 
 
-# ----- what is added to a verdict: one amendment after the other, and one that fails takes nothing along
+# ----- amendments of a verdict: one after the other; a failure changes nothing else
 
 
 FASTER = (Experiment("twice as fast", 8.5),)
@@ -148,12 +148,12 @@ def found() -> Small:
 
 
 def with_an_alternative(found: Small) -> Verdict:
-    """The verdict as if the base model were indistinguishable from its own."""
+    """The verdict as if the base model were indistinguishable from its model."""
     return replace(found.verdict, indistinguishable_models=(found.base,))
 
 
 def another_model(found: Small) -> FinalModel:
-    """A final model that is not the search's own."""
+    """A final model other than that of the search."""
     return FinalModel(found.base, (found.case.train,))
 
 
@@ -187,7 +187,7 @@ def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypat
         (RuntimeError("XLA gave up\nat length"), "RuntimeError: XLA gave up"),
     ],
 )
-def test_what_fails_is_said_and_what_comes_after_it_is_made(
+def test_a_failed_amendment_is_reported_and_the_next_one_is_made(
     found: Small, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ):
     open_verdict, refitted = with_an_alternative(found), another_model(found)
@@ -202,14 +202,14 @@ def test_what_fails_is_said_and_what_comes_after_it_is_made(
     assert last.final.model is open_verdict.model and last.final.fitted_to == (found.case.train,)
 
 
-def test_a_refit_that_cannot_be_written_is_no_final_model(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_a_refit_without_a_posterior_is_no_final_model(found: Small, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(missing, "final_refit", lambda *arguments: another_model(found))
     monkeypatch.setattr(missing, "extended", failing(ValueError("its covariance is singular")))
     *_, last = amended(found.case, found.verdict, record("train"))
     assert last.states[REFIT] == f"{NOT_MADE}: its covariance is singular" and last.final.model is found.verdict.model
 
 
-def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_a_refit_that_does_not_converge_is_reported(found: Small, monkeypatch: pytest.MonkeyPatch):
     short = replace(
         found.case, config=replace(found.case.config, refine=replace(found.case.config.refine, iterations=1))
     )
@@ -219,12 +219,12 @@ def test_a_refit_that_does_not_converge_is_said(found: Small, monkeypatch: pytes
     }  # fmt: skip
 
 
-def test_nothing_is_added_where_nothing_is_due(found: Small):
+def test_there_are_no_amendments_if_none_is_due(found: Small):
     (only,) = amended(found.case, replace(found.verdict, model=found.base), record("train"))
     assert only.states == {EXPERIMENTS: NOT_NEEDED, REFIT: NOT_NEEDED}
 
 
-def test_a_stop_is_no_failure(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_a_keyboard_interrupt_is_raised(found: Small, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(missing, "final_refit", failing(KeyboardInterrupt()))
     steps = amended(found.case, found.verdict, record("train"))
     assert next(steps).states[REFIT] == TO_BE_MADE

@@ -1,4 +1,4 @@
-"""What a fit leaves on another motion, beyond what its own uncertainty explains: only that is something missing."""
+"""The discrepancy on another motion that the uncertainty of a fit does not explain."""
 
 from __future__ import annotations
 
@@ -12,15 +12,8 @@ from small_gap import FLOOR, Small, quiet, record, small
 
 from droid_jax.discrepancy.candidates import project
 from droid_jax.discrepancy.case import Case, make_case
-from droid_jax.discrepancy.fitting import (
-    LONGEST_STEP,
-    FittedModel,
-    base_fit,
-    refit,
-    remaining_discrepancy,
-    remaining_residuals,
-    transfer_spread,
-)
+from droid_jax.discrepancy.fitting import FittedModel, base_fit, refit
+from droid_jax.discrepancy.posterior import LONGEST_STEP, remaining_discrepancy, remaining_residuals, transfer_spread
 from droid_jax.discrepancy.statistics import Repeats
 from droid_jax.identify.identifiability import posterior_of
 
@@ -32,7 +25,7 @@ def found() -> Small:
 
 @pytest.fixture(scope="module")
 def whole(found: Small) -> tuple[Case, FittedModel]:
-    """Nothing is hidden."""
+    """A search with nothing hidden."""
     case = make_case(
         found.scene, found.case.base, found.case.effects, record("train", preload=0.0),
         record("validation", preload=0.0),
@@ -42,7 +35,7 @@ def whole(found: Small) -> tuple[Case, FittedModel]:
 
 
 def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
-    """Share that stays of what the other recording does otherwise by `off` [M]."""
+    """Remaining share of a difference `off` [M] on the other recording."""
     validation = case.validation
     other: Any = SimpleNamespace(
         cost=validation.cost,
@@ -56,8 +49,8 @@ def kept(case: Case, model: FittedModel, off: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_what_the_fit_does_not_constrain_is_allowed_for_and_nothing_else(whole: tuple[Case, FittedModel]):
-    """Two deviations along the axis that the other recording shows best, and something that no axis does."""
+def test_only_the_uncertainty_of_the_fit_is_subtracted(whole: tuple[Case, FittedModel]):
+    """Two deviations along the axis to which the other recording is most sensitive, and a difference along none."""
     case, model = whole
     slopes = transfer_spread(case.train, case.validation, model)
     shown = slopes[:, np.argmax(np.linalg.norm(slopes, axis=0))]
@@ -69,7 +62,7 @@ def test_what_the_fit_does_not_constrain_is_allowed_for_and_nothing_else(whole: 
 
 @pytest.mark.slow
 def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
-    """One for each axis; together they span what any one parameter does."""
+    """There is one for each axis; together they span the effect of every parameter."""
     case, model = whole
     slopes, refined = transfer_spread(case.train, case.validation, model), model.refined
     assert slopes.shape == (len(case.validation.common(model.values)[0]), len(refined.x))
@@ -78,29 +71,29 @@ def test_the_slopes_are_of_one_deviation(whole: tuple[Case, FittedModel]):
     here, there = (case.full_space.embed(model.space, model.space.from_search(x)[None], model.values)
                    for x in (refined.x, refined.x + step))  # fmt: skip
     moved = (case.validation.common(there) - case.validation.common(here))[0]
-    # What one parameter does is inside the span of what all axes do, as far as they are constrained.
+    # The effect of one parameter is in the span of all axes that are constrained.
     assert np.linalg.norm(project(moved[None], slopes, np.full(len(slopes.T), 1e6))[0]) < 0.1 * np.linalg.norm(moved)
 
 
 @pytest.mark.slow
-def test_what_is_really_missing_stays(found: Small):
-    """The hidden preload acts on the other motion in a way that no uncertain parameter does."""
+def test_a_missing_effect_remains(found: Small):
+    """No uncertain parameter acts on the other motion like the hidden preload."""
     case, base = found.case, found.base
     before = case.validation.discrepancy_at(base.values)
     assert before > FLOOR and remaining_discrepancy(case.train, case.validation, base) > 0.5 * before
 
 
 @pytest.mark.slow
-def test_the_verdict_says_what_remains(found: Small):
+def test_the_verdict_holds_the_remaining_discrepancy(found: Small):
     case, verdict = found.case, found.verdict
     assert verdict.remainder == pytest.approx(remaining_discrepancy(case.train, case.validation, verdict.model))
-    # Where little is taken away it may lie above U by noise, of which both are free on average only.
+    # If little is subtracted, it may lie above U by noise: both are unbiased on average only.
     assert verdict.remainder is not None and verdict.remainder <= 1.1 * verdict.discrepancies["validation"][1]
 
 
 @pytest.mark.slow
-def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedModel]):
-    """Noise about the model's own replay: U is zero on average, not less for what the projection takes of the mean."""
+def test_the_remaining_discrepancy_of_noise_is_zero_on_average(whole: tuple[Case, FittedModel]):
+    """Noise about the model's replay: the projection does not make the mean of U negative."""
     case, model = whole
     validation = case.validation
     assert isinstance(validation.resampling, Repeats)
@@ -123,8 +116,8 @@ def test_of_noise_alone_nothing_remains_on_average(whole: tuple[Case, FittedMode
 
 
 @pytest.mark.slow
-def test_more_repeats_of_the_fit_allow_less(found: Small):
-    """What is constrained better may be off by less."""
+def test_more_repeats_in_the_fit_explain_less(found: Small):
+    """A better constrained parameter explains a smaller difference."""
 
     def size(repeats: int) -> float:
         made = {role: record(role, repeats, preload=0.0) for role in ("train", "validation")}
@@ -135,8 +128,8 @@ def test_more_repeats_of_the_fit_allow_less(found: Small):
     assert size(32) < 0.6 * size(8)
 
 
-def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, FittedModel]):
-    """On a replay that is linear, one of the parameters at its bound, each parameter an axis of its own."""
+def test_a_bound_does_not_change_a_slope(whole: tuple[Case, FittedModel]):
+    """A linear replay, one parameter at its bound, each parameter a principal axis."""
     case, model = whole
     space, count = model.space, len(model.space)
     x = model.refined.x.copy()
@@ -157,7 +150,7 @@ def test_a_bound_does_not_halve_a_slope(whole: tuple[Case, FittedModel]):
 
 
 @pytest.mark.slow
-def test_blocks_of_one_motion_allow_nothing(whole: tuple[Case, FittedModel]):
+def test_nothing_is_subtracted_for_blocks_of_one_motion(whole: tuple[Case, FittedModel]):
     case, model = whole
     blocks: Any = SimpleNamespace(resampling=SimpleNamespace(repeated=False))
     left = remaining_residuals(blocks, case.validation, model)

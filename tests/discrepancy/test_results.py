@@ -1,4 +1,4 @@
-"""What a search leaves in its folder: the verdict's own numbers, readable again, and none where there are none."""
+"""Files of a search: the numbers of the verdict, and null for those that were not computed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def arrays(folder: Path) -> dict[str, np.ndarray]:
         return dict(file)
 
 
-def test_what_was_hidden_is_in_the_file(found: Small, answer: dict[str, Any]):
+def test_the_hidden_effect_is_in_the_file(found: Small, answer: dict[str, Any]):
     assert (answer["format"], answer["version"]) == (FORMAT, VERSION)
     assert answer["verdict"] == Conclusion.NAMED.value
     assert answer["effects"] == [PRELOAD_ENTRY] and answer["indistinguishable"] == [[]]
@@ -69,7 +69,7 @@ def test_what_was_hidden_is_in_the_file(found: Small, answer: dict[str, Any]):
     assert MORE.items() <= answer.items()
 
 
-def test_discrepancies_are_the_verdicts_and_distances_those_of_the_traces(
+def test_discrepancies_are_those_of_the_verdict_and_distances_those_of_the_traces(
     found: Small, answer: dict[str, Any], arrays: dict[str, np.ndarray]
 ):
     assert list(answer["discrepancies"]) == ["train", "validation"]
@@ -84,7 +84,7 @@ def test_discrepancies_are_the_verdicts_and_distances_those_of_the_traces(
         assert entry["torque_after"] < entry["torque_before"]
 
 
-def test_traces_have_one_shape_and_their_clock(found: Small, arrays: dict[str, np.ndarray]):
+def test_traces_have_one_shape_and_a_clock(found: Small, arrays: dict[str, np.ndarray]):
     assert arrays["joints"].tolist() == list(JOINTS)
     for role, recording in found.recordings.items():
         traces = {name: arrays[f"{role}.{name}"] for name in ("time", "measured", "scatter", "before", "after")}
@@ -100,13 +100,13 @@ def test_traces_have_one_shape_and_their_clock(found: Small, arrays: dict[str, n
 
 
 def without_nuisances(residual_set: ResidualSet) -> ResidualSet:
-    """Without nuisances of the recording's own."""
+    """The residual set without per-recording nuisances."""
     return dataclasses.replace(residual_set, nuisances=(), nuisance_columns=None)
 
 
 @pytest.mark.parametrize("off", [0.15, 0.8])
-def test_a_recordings_own_offset_is_no_discrepancy_of_the_traces(found: Small, off: float):
-    """A sensor that was off on the second day, in units of its prior by 1.5 and by 8: U fits that, and so do traces."""
+def test_a_torque_offset_of_one_recording_is_no_discrepancy_of_the_traces(found: Small, off: float):
+    """U and the traces have a fitted torque offset of the second recording, of 1.5 or 8 prior deviations."""
     recording = found.recordings["validation"]
     torque = recording.channel("torque")
     shifted = dataclasses.replace(torque, values=torque.values + np.float32([0.0, off, 0.0]))
@@ -126,8 +126,8 @@ def test_a_recordings_own_offset_is_no_discrepancy_of_the_traces(found: Small, o
     )
 
 
-def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
-    """A recording whose channels come in another order ends up in the order of the first."""
+def test_joints_have_the_order_of_the_first_recording(found: Small):
+    """The columns of another recording are in another order."""
     case = found.case
     channel = case.validation.comparison.channels[0]
     order = [2, 0, 1]
@@ -157,7 +157,7 @@ def test_joints_keep_one_order_whatever_the_recordings_have(found: Small):
             np.testing.assert_allclose(plain[key], again[key], rtol=1e-9)
 
 
-def test_grounds_are_all_there(found: Small, answer: dict[str, Any]):
+def test_all_tests_are_in_the_file(found: Small, answer: dict[str, Any]):
     first = answer["score_tests"][0]["ranking"]
     assert PRELOAD_ENTRY.items() <= first[0].items()
     assert len({(r["effect"], r["location"]) for r in first}) == len(first) == 3
@@ -175,7 +175,7 @@ def test_grounds_are_all_there(found: Small, answer: dict[str, Any]):
     assert answer["phases"]["train"][1] == {"name": "second", "start": 1.5, "end": pytest.approx(2.998)}
 
 
-def test_cells_are_the_verdicts(found: Small, answer: dict[str, Any]):
+def test_cells_are_those_of_the_verdict(found: Small, answer: dict[str, Any]):
     for when, cells in (("before", found.verdict.before), ("after", found.verdict.after)):
         for entry, cell in zip(answer["cells"][when], cells, strict=True):
             key = cell.key
@@ -185,7 +185,7 @@ def test_cells_are_the_verdicts(found: Small, answer: dict[str, Any]):
             }  # fmt: skip
 
 
-def test_trends_are_the_verdicts(found: Small, answer: dict[str, Any]):
+def test_trends_are_those_of_the_verdict(found: Small, answer: dict[str, Any]):
     trend, (entry,) = found.verdict.trend, answer["trends"]
     assert trend is not None
     assert (entry["effect"], entry["location"]) == (trend.key.effect, trend.key.location)
@@ -206,13 +206,13 @@ def test_shifts_are_in_deviations_of_the_base_fit(answer: dict[str, Any]):
         assert shifts[name]["after"] == pytest.approx(value, rel=0.15)
 
 
-def test_the_report_reads_it(folder: Path):
+def test_the_report_reads_the_file(folder: Path):
     gap = read_gap(folder)
     assert gap.roles == ["train", "validation"]
     assert largest_shifts(gap.found.shifts)[0].name == "door_stiffness"
 
 
-def test_alternatives_experiments_and_what_was_not_tried_come_along(found: Small):
+def test_alternatives_experiments_and_skipped_fits_are_in_the_file(found: Small):
     verdict = dataclasses.replace(
         found.verdict, conclusion=Conclusion.INDISTINGUISHABLE,
         indistinguishable=(((DRAG,), (DRAG, EffectKey("payload", "elbow"))),),
@@ -239,7 +239,7 @@ def test_hints_are_in_the_file(found: Small):
 
 
 def test_every_threshold_is_in_the_file(found: Small, answer: dict[str, Any]):
-    """Those of this search, its blocks and its settings too."""
+    """So are the settings of the search and of its blocks."""
     config = found.case.config
     assert set(answer["config"]) == {f.name for f in dataclasses.fields(DiscrepancyConfig)}
     for name in ("selection", "blocks"):
@@ -252,8 +252,8 @@ def test_every_threshold_is_in_the_file(found: Small, answer: dict[str, Any]):
     assert (written["minimum_closed"], written["significance"]) == (0.3, 0.02)
 
 
-def test_shapes_come_once_with_their_intervals(found: Small):
-    """An effect's shape is one at all its locations; a nuisance serves as one here."""
+def test_shape_parameters_are_listed_once_with_their_intervals(found: Small):
+    """All locations of an effect share a shape parameter; a nuisance serves as one here."""
     name, (part,) = "torque_offset[elbow]", found.verdict.model.parts
     shaped = dataclasses.replace(part, shape_parameters={name: 0.0})
     twice = (shaped, dataclasses.replace(shaped, location="elsewhere", coefficients=()))
@@ -265,8 +265,8 @@ def test_shapes_come_once_with_their_intervals(found: Small):
     assert shape["low"] < shape["value"] == model.values[found.case.full_space.index(name)] < shape["high"]
 
 
-def test_where_nothing_was_asked_or_found_there_are_no_numbers(found: Small):
-    """An unconverged fit, and a discrepancy below the discretisation error: null, never a made-up share."""
+def test_numbers_that_were_not_computed_are_null(found: Small):
+    """A fit that did not converge, and a discrepancy below the discretisation error."""
     nothing = dataclasses.replace(
         found.verdict, conclusion=Conclusion.UNCONVERGED, effects=(), indistinguishable=(), model=found.base,
         score_tests=(), validation_tests=(), discretisation_error=1e4, trend=None,
@@ -290,16 +290,16 @@ def test_the_test_recording_is_a_role_like_the_others(found: Small):
     np.testing.assert_array_equal(arrays["test.after"], arrays["validation.after"])
 
 
-def test_it_is_written_whole_or_not_at_all(found: Small, tmp_path: Path):
-    """gap.json comes last: where writing fails before it, no run looks finished."""
+def test_gap_json_is_written_last(found: Small, tmp_path: Path):
+    """If writing an earlier file fails, the run does not look finished."""
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_gap(tmp_path, found.case, found.verdict, found.own, {"seconds": float("nan")})
     written = ["apply_fit.py", "extended.json", "extended.xml", "fitted.json", "gap.npz", "mjlab_terms.py"]
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix != ".patch") == written
 
 
-def test_a_value_near_a_bound_is_at_it_only_where_it_may_be_there():
-    """Dry friction of 0.0496 N m in a range up to 5 was called at its lower bound, with an interval far from it."""
+def test_a_value_near_a_bound_is_at_it_if_its_interval_reaches_it():
+    """Dry friction of 0.0496 N m in a range up to 5 was reported at its lower bound, far outside its interval."""
     p = Parameter("friction", "N m", 0.0, 0.3, 0.0, 5.0)
     assert _reached(p, 0.0496, (0.0465, 0.0526), "lower") == ""
     assert _reached(p, 0.0496, (0.0, 0.1), "lower") == _reached(p, 0.0, (0.003, 0.1), "lower") == "lower"

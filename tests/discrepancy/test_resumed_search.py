@@ -1,4 +1,4 @@
-"""Going on after a stop: a search that is run again reads the replays that it has made."""
+"""Continuation after a stop: a search that is run again reads the replays that it has made."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def found() -> Small:
 
 
 def wrapped(case: Case, wrap: Wrap) -> Case:
-    """The case, all its replays through `wrap`."""
+    """The case with all its replays through `wrap`."""
 
     def of(e: ResidualSet) -> ResidualSet:
         return dataclasses.replace(e, whitened=wrap(e.whitened), distances=wrap(e.distances))
@@ -32,7 +32,7 @@ def wrapped(case: Case, wrap: Wrap) -> Case:
 
 
 def no_replays(case: Case) -> Case:
-    """The case, whose every replay fails the test."""
+    """The case in which every replay fails the test."""
     return wrapped(case, lambda compute: lambda rows: pytest.fail("this replay was made before"))
 
 
@@ -40,7 +40,7 @@ def fitted(case: Case) -> FittedModel:
     return base_fit(case.train, case.base, case.config, quiet)
 
 
-def test_recordings_do_not_share_what_they_remember(found: Small, tmp_path: Path):
+def test_recordings_do_not_share_cached_replays(found: Small, tmp_path: Path):
     case = found.case.with_replay_cache(tmp_path)
     row = found.case.full_space.mean[None]
     assert case.train.distances(row)[0, 0] != case.validation.distances(row)[0, 0]
@@ -51,7 +51,7 @@ def test_recordings_do_not_share_what_they_remember(found: Small, tmp_path: Path
 
 
 def test_a_base_fit_is_resumed_bit_for_bit(found: Small, tmp_path: Path):
-    """Stopped after a third of its replays, then run again; and once more without any replay."""
+    """It is stopped after a third of its replays, run again, and run once more without any replay."""
     left, made = [0], [0]
 
     def stopping(compute: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
@@ -83,8 +83,8 @@ def test_a_base_fit_is_resumed_bit_for_bit(found: Small, tmp_path: Path):
             np.testing.assert_array_equal(getattr(model.refined, name), getattr(whole.refined, name))
 
 
-def test_a_search_that_is_run_again_replays_nothing_and_ends_alike(found: Small, tmp_path: Path):
-    """What a killed run does when the same command is given once more."""
+def test_a_search_that_is_run_again_makes_no_replay_and_has_the_same_result(found: Small, tmp_path: Path):
+    """A killed run does this when its command is given again."""
     search_effects(found.case.with_replay_cache(tmp_path), found.base, FLOOR)
     again = search_effects(no_replays(found.case).with_replay_cache(tmp_path), found.base, FLOOR)
     assert again.effects == found.verdict.effects and again.discrepancies == found.verdict.discrepancies

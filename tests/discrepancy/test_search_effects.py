@@ -1,4 +1,4 @@
-"""The search, step by step and as a whole: what is tried, what is left out, what is taken out again."""
+"""The search, step by step and as a whole."""
 
 from __future__ import annotations
 
@@ -12,26 +12,22 @@ import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, small, small_scene
 
-from droid_jax.discrepancy import search
-from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
-from droid_jax.discrepancy.case import Case, make_case, restrained
-from droid_jax.discrepancy.config import DiscrepancyConfig
-from droid_jax.discrepancy.fitting import FittedModel, base_fit
-from droid_jax.discrepancy.search import (
+from droid_jax.discrepancy import candidate_fits, cross_validation, search
+from droid_jax.discrepancy.candidate_fits import (
     Notes,
     Problem,
-    SearchState,
     converged_model,
-    open_directions,
-    pair_step,
     polished,
     pruned,
-    search_effects,
-    selection_step,
     staged_refit,
     target_objective,
     without,
 )
+from droid_jax.discrepancy.candidates import directions_of, proposals, score_test
+from droid_jax.discrepancy.case import Case, make_case, restrained
+from droid_jax.discrepancy.config import DiscrepancyConfig
+from droid_jax.discrepancy.fitting import FittedModel, base_fit
+from droid_jax.discrepancy.search import SearchState, open_directions, pair_step, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
 from droid_jax.discrepancy.verdict import Conclusion
@@ -52,7 +48,7 @@ def found() -> Small:
 
 @pytest.fixture(scope="module")
 def first(found: Small) -> tuple[SearchState, SelectionStep]:
-    """After one step."""
+    """The state after one step, and the step."""
     state, info = selection_step(SearchState(found.base), problem_of(found))
     assert info is not None
     return state, info
@@ -66,21 +62,31 @@ def searched(case: Case) -> Any:
     return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
 
 
-# Where U holds the noise -------------------------------------------------------------------
+# Logs, whose U includes the noise -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("repeated", "left", "reasons", "kept"),
     [
-        (False, {"a": 0.3, "b": 0.02}, (Reason.SMALL_GAIN,), {"b", "c"}),  # b leaves something, a does not
-        (False, {"a": 0.02}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # the best one does: the others are not asked
-        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN,), {"c"}),  # c takes too little whatever it leaves
-        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN, Reason.NOT_CONFIRMED), {"c"}),  # weak, and may be the truth
+        (
+            False,
+            {"a": 0.3, "b": 0.02},
+            (Reason.SMALL_GAIN,),
+            {"b", "c"},
+        ),  # beside b the score test finds more, beside a not
+        (
+            False,
+            {"a": 0.02},
+            (Reason.SMALL_GAIN,),
+            {"a", "b", "c"},
+        ),  # it finds more beside the best: the others are not tested
+        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN,), {"c"}),  # the gain of c is too small in any case
+        (False, {"a": 0.3, "b": 0.3}, (Reason.SMALL_GAIN, Reason.NOT_CONFIRMED), {"c"}),  # weak: tested too
         (False, {}, (Reason.SMALL_GAIN, Reason.MAY_BE_ZERO), {"a", "b", "c"}),
         (True, {}, (Reason.SMALL_GAIN,), {"a", "b", "c"}),  # U of repeats holds no noise
     ],
 )
-def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
+def test_a_small_gain_is_accepted_if_the_score_test_finds_nothing_more(
     monkeypatch: pytest.MonkeyPatch, repeated: bool, left: dict[str, float], reasons: tuple[Reason, ...], kept: set[str]
 ):
     models: Any = [SimpleNamespace(name=name, parts=(), coefficients=()) for name in "cab"]
@@ -94,7 +100,9 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     problem: Any = SimpleNamespace(case=case, base_discrepancy=1.0, directions=(), late=False, progress=quiet)
     asked = dict(left)
     monkeypatch.setattr(search, "open_directions", lambda *_: ("another",))
-    monkeypatch.setattr(search, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name)))
+    monkeypatch.setattr(
+        cross_validation, "score_test", lambda _, model, *rest: SimpleNamespace(p=0.4 * asked.pop(model.name))
+    )
     base: Any = SimpleNamespace(parts=())
     extended: Any = SimpleNamespace(parts=("drag",))
     judged = search.without_small_gains(problem, base, models, tests)
@@ -104,8 +112,8 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
         {*t.reasons} >= {r for r in before.reasons if r.reason is not Reason.SMALL_GAIN}
         for t, before in zip(judged, tests, strict=True)
     )
-    assert not asked  # each was asked once
-    assert search.without_small_gains(problem, extended, models, tests) == tests  # beside another effect
+    assert not asked  # each was tested once
+    assert search.without_small_gains(problem, extended, models, tests) == tests  # for a further effect
 
 
 @pytest.mark.parametrize(
@@ -113,12 +121,12 @@ def test_a_small_gain_is_no_reason_where_a_model_leaves_nothing_to_find(
     [
         ("both", (Reason.NOT_CONFIRMED,), "bc"),  # the two best
         ("both", (Reason.NOT_CONFIRMED, Reason.BELOW_MINIMUM_SIZE, Reason.SMALL_GAIN), "bc"),
-        ("both", (Reason.NOT_CONFIRMED, Reason.MAY_BE_ZERO), ""),  # something else is against it
+        ("both", (Reason.NOT_CONFIRMED, Reason.MAY_BE_ZERO), ""),  # there is another reason
         ("both", (Reason.SMALL_GAIN,), ""),  # it is confirmed
         (None, (Reason.NOT_CONFIRMED,), ""),  # other repeats or motions validate
     ],
 )
-def test_the_best_models_are_confirmed_with_the_halves_of_a_log_in_turns(
+def test_the_best_models_are_cross_validated(
     monkeypatch: pytest.MonkeyPatch, both: Any, reasons: tuple[Reason, ...], asked: str
 ):
     models: Any = [SimpleNamespace(name=name) for name in "abc"]
@@ -128,8 +136,8 @@ def test_the_best_models_are_confirmed_with_the_halves_of_a_log_in_turns(
     case = SimpleNamespace(both=both, config=DiscrepancyConfig())
     problem: Any = SimpleNamespace(case=case, late=False, progress=quiet)
     found = {"b": 0.01, "c": 0.3}
-    monkeypatch.setattr(search, "_p_in_turns", lambda case, before, model: found[model.name])
-    judged = search.confirmed_in_turns(problem, SimpleNamespace(), models, tests)  # type: ignore[arg-type]
+    monkeypatch.setattr(cross_validation, "_cross_validated_p", lambda case, before, model: found[model.name])
+    judged = cross_validation.cross_validated(problem, SimpleNamespace(), models, tests)  # type: ignore[arg-type]
     assert [t.p for t in judged] == [found[m.name] if m.name in asked else 0.2 for m in models]
     confirmed = {
         m.name for m, t in zip(models, judged, strict=True) if Reason.NOT_CONFIRMED not in {r.reason for r in t.reasons}
@@ -137,8 +145,8 @@ def test_the_best_models_are_confirmed_with_the_halves_of_a_log_in_turns(
     assert confirmed == ({"b"} if asked else {"a", "b", "c"} if Reason.NOT_CONFIRMED not in reasons else set())
 
 
-def test_where_nothing_else_could_be_asked_nothing_is_left_to_find():
-    """One effect at one place: no score test of no direction."""
+def test_a_small_gain_is_accepted_if_there_is_no_other_direction():
+    """One effect at one location: there is no direction for a score test."""
     model: Any = SimpleNamespace(name="a", parts=(), coefficients=())
     small: Any = ValidationTest((), 0, 0.9, 0.88, 0.001, {}, 1.0, (Rejection(Reason.SMALL_GAIN, ""),))
     case = SimpleNamespace(
@@ -149,12 +157,10 @@ def test_where_nothing_else_could_be_asked_nothing_is_left_to_find():
     assert judged.reasons == ()
 
 
-# From state to state -----------------------------------------------------------------------
+# Selection steps -----------------------------------------------------------------------
 
 
-def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
-    found: Small, first: tuple[SearchState, SelectionStep]
-):
+def test_a_step_selects_an_effect_and_does_not_change_its_state(found: Small, first: tuple[SearchState, SelectionStep]):
     begin = SearchState(found.base)
     before, values = copy.copy(vars(begin)), found.base.values.copy()
     state, info = selection_step(begin, problem_of(found))
@@ -168,20 +174,20 @@ def test_a_step_selects_and_leaves_the_state_it_was_given_unchanged(
     assert same.tests == info.tests == first[1].tests
 
 
-def test_a_step_beyond_the_most_effects_is_none(found: Small, first: tuple[SearchState, SelectionStep]):
+def test_there_is_no_step_beyond_the_largest_number_of_effects(found: Small, first: tuple[SearchState, SelectionStep]):
     state, _ = first
     assert found.case.config.max_effects == 1
     ended, info = selection_step(state, problem_of(found))
     assert info is None and ended.finished and not ended.exhausted and ended.model is state.model
 
 
-def test_a_step_with_nothing_left_to_ask_has_exhausted_the_candidates(found: Small):
+def test_a_step_without_directions_has_exhausted_the_candidates(found: Small):
     ended, info = selection_step(SearchState(found.base), replace(problem_of(found), directions=()))
     assert info is None and ended.finished and ended.exhausted and ended.model is found.base
 
 
-def test_a_step_that_finds_nothing_significant_tries_nothing(found: Small):
-    """The test rejects, yet the time step alone would leave as much."""
+def test_a_step_without_a_significant_discrepancy_refits_nothing(found: Small):
+    """The score test rejects, but the error of the time step is as large."""
     problem = replace(problem_of(found), discretisation_error=2.0 * found.base.discrepancy)
     ended, info = selection_step(SearchState(found.base), problem)
     assert info is not None and (info.tried, info.tests, info.selected) == ((), (), None)
@@ -190,21 +196,21 @@ def test_a_step_that_finds_nothing_significant_tries_nothing(found: Small):
 
 
 def test_the_significance_is_configured(found: Small):
-    """A p-value of 1/128, the smallest that eight repeats allow."""
+    """The p-value is 1/128, the smallest of eight repeats."""
     strict = replace(found.case.config, selection=replace(found.case.config.selection, significance=0.001))
     problem = replace(problem_of(found), case=replace(found.case, config=strict))
     ended, info = selection_step(SearchState(found.base), problem)
     assert info is not None and info.score_test.p == pytest.approx(1 / 128) and info.tried == () and ended.exhausted
 
 
-def test_a_search_without_time_looks_at_one_group_of_candidates(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(search, "TOGETHER", 1)
+def test_a_search_without_time_makes_one_batch_of_one_step_fits(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(candidate_fits, "ONE_STEP_BATCH", 1)
     state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
-    assert state.notes.not_tried[0] == "2 of 3 candidates not looked at" and state.notes.failed == ()
+    assert state.notes.not_tried[0] == "2 of 3 candidates without a one-step fit" and state.notes.failed == ()
 
 
-def test_a_search_without_time_refits_one_candidate_and_says_what_it_left_out(found: Small):
+def test_a_search_without_time_refits_one_candidate_and_reports_the_others(found: Small):
     state, info = selection_step(SearchState(found.base), problem_of(found, deadline=0.0))
     assert info is not None and [m.keys for m in info.tried] == [(PRELOAD,)]
     assert state.notes.not_tried[0] == "2 of 3 candidates not refitted" and state.notes.failed == ()
@@ -213,40 +219,40 @@ def test_a_search_without_time_refits_one_candidate_and_says_what_it_left_out(fo
     assert verdict.not_tried == state.notes.not_tried and verdict.effects == (PRELOAD,)
 
 
-def test_refits_stop_when_time_is_up_but_for_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_the_first_refit_is_made_after_the_deadline_too(found: Small, monkeypatch: pytest.MonkeyPatch):
     def refit(train: Any, base: Any, parts: Any, *rest: Any) -> Any:
         if parts[0].effect == "payload":
             raise NotReplayed("none of the starts could be replayed")
         return SimpleNamespace(keys=(parts[0].key,), refined=SimpleNamespace(objective=1.0))
 
-    monkeypatch.setattr(search, "refit", refit)
-    starters = [((part,), found.base.values) for part in candidates(found.case.effects)]
-    names = [str(part.key) for (part,), _ in starters]
-    models, notes = staged_refit(problem_of(found), starters, 1e9, "candidates not refitted")
+    monkeypatch.setattr(candidate_fits, "refit", refit)
+    starts = [((part,), found.base.values) for part in candidates(found.case.effects)]
+    names = [str(part.key) for (part,), _ in starts]
+    models, notes = staged_refit(problem_of(found), starts, 1e9, "candidates not refitted")
     assert notes == Notes(failed=tuple(n for n in names if n.startswith("payload")))
-    assert len(models) == len(starters) - len(notes.failed) == 2
-    hinge = [s for s in starters if s[0][0].effect != "payload"]
+    assert len(models) == len(starts) - len(notes.failed) == 2
+    hinge = [s for s in starts if s[0][0].effect != "payload"]
     models, notes = staged_refit(problem_of(found, deadline=0.0), hinge, 1e9, "candidates not refitted")
     assert len(models) == 1 and notes == Notes(not_tried=("1 of 2 candidates not refitted",))
     assert notes + Notes(("a",), ("b",)) == Notes(("a",), ("1 of 2 candidates not refitted", "b"))
 
 
-def test_a_refit_aims_at_the_best_so_far(found: Small, monkeypatch: pytest.MonkeyPatch):
-    aims, objectives = list[float](), iter([7.0, 3.0, 5.0])
+def test_the_target_of_a_refit_is_the_best_objective_so_far(found: Small, monkeypatch: pytest.MonkeyPatch):
+    targets, objectives = list[float](), iter([7.0, 3.0, 5.0])
 
     def refit(train: Any, base: Any, parts: Any, start: Any, config: Any) -> Any:
-        aims.append(config.target_objective)
+        targets.append(config.target_objective)
         return SimpleNamespace(refined=SimpleNamespace(objective=next(objectives)))
 
-    monkeypatch.setattr(search, "refit", refit)
-    starters = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
-    staged_refit(problem_of(found), starters, 6.0, "candidates not refitted")
-    assert aims == [6.0, 6.0, 3.0]
+    monkeypatch.setattr(candidate_fits, "refit", refit)
+    starts = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
+    staged_refit(problem_of(found), starts, 6.0, "candidates not refitted")
+    assert targets == [6.0, 6.0, 3.0]
 
 
 @pytest.mark.parametrize("blocks", [False, True])
-def test_the_aim_is_the_objective_of_half_the_share_that_an_effect_must_take(found: Small, blocks: bool):
-    """U of 4, a fifth of which an effect must take away: the objective falls by a tenth of it."""
+def test_the_target_is_half_of_the_gain_that_an_effect_must_reach(found: Small, blocks: bool):
+    """An effect must reduce U = 4 by a fifth; the target is the objective with a tenth less."""
     rows = Blocks(np.array([0] * 6 + [1] * 6 + [OUTSIDE] * 18)) if blocks else Repeats(np.zeros((1, 30)))
     count = 12 if blocks else 30
     problem = problem_of(found)
@@ -269,7 +275,7 @@ def two_effects(found: Small, **changes: Any) -> Problem:
     return replace(problem_of(found, **changes), case=case)
 
 
-def test_pairs_are_tried_where_nothing_is_named_and_their_score_test_is_reported_once(
+def test_pairs_are_refitted_if_nothing_is_selected_and_their_score_test_is_reported_once(
     found: Small, first: tuple[SearchState, SelectionStep]
 ):
     _, info = first
@@ -282,11 +288,13 @@ def test_pairs_are_tried_where_nothing_is_named_and_their_score_test_is_reported
         assert test.before == 0 and len(test.keys) == 2
 
 
-def test_no_pairs_where_they_are_not_asked_for_or_not_needed(found: Small, first: tuple[SearchState, SelectionStep]):
+def test_there_are_no_pairs_if_they_are_not_allowed_or_not_needed(
+    found: Small, first: tuple[SearchState, SelectionStep]
+):
     state, info = first
     unnamed = SearchState(found.base, (replace(info, selected=None, chosen=None),), finished=True)
     assert pair_step(unnamed, problem_of(found)) is unnamed  # one effect at most
-    assert pair_step(state, two_effects(found)) is state  # one effect that leaves little
+    assert pair_step(state, two_effects(found)) is state  # one effect that explains the discrepancy
     for done in (
         replace(unnamed, exhausted=True),
         replace(unnamed, steps=()),
@@ -297,11 +305,11 @@ def test_no_pairs_where_they_are_not_asked_for_or_not_needed(found: Small, first
     assert late.notes == Notes(not_tried=("pairs of effects not tried",)) and late.steps == unnamed.steps
 
 
-# What goes wrong ---------------------------------------------------------------------------
+# Failures ---------------------------------------------------------------------------
 
 
 def bomb(scene: Scene) -> Effect:
-    """A force that is neutral at zero and not a number beside it."""
+    """An effect whose force is zero at neutral and NaN elsewhere."""
     dof = scene.dof("door")
 
     def force(theta, state):
@@ -318,8 +326,8 @@ def bomb(scene: Scene) -> Effect:
 
 
 @pytest.mark.slow
-def test_an_effect_that_blows_up_is_left_out_and_named():
-    """What is really missing is found all the same."""
+def test_an_effect_that_blows_up_is_left_out_and_reported():
+    """The missing effect is found nevertheless."""
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, (*library(scene, EFFECTS), bomb(scene))))
     explosive = EffectKey("bomb", "door")
@@ -331,7 +339,7 @@ def test_an_effect_that_blows_up_is_left_out_and_named():
 
 
 def late_bomb(scene: Scene) -> Effect:
-    """A preload that is neutral at its upper bound, and no number at the size that the preload has."""
+    """A preload that is neutral at its upper bound, and NaN at the true size of the preload."""
     dof = scene.dof("door")
 
     def force(theta, state):
@@ -349,13 +357,13 @@ def late_bomb(scene: Scene) -> Effect:
 
 
 @pytest.mark.slow
-def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch):
-    """The score test's small step is replayed, the proposal is not."""
+def test_a_refit_that_blows_up_at_its_start_is_left_out_and_reported(monkeypatch: pytest.MonkeyPatch):
+    """The replay of the score test's step is finite, that of the proposal is not."""
 
     def unmoved(train: Any, model: Any, asked: Any, config: Any) -> list[tuple[np.ndarray, float]]:
         return [(proposed, -np.inf) for *_, proposed in asked]
 
-    monkeypatch.setattr(search, "one_step_fits", unmoved)
+    monkeypatch.setattr(candidate_fits, "one_step_fits", unmoved)
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, (late_bomb(scene),)))
     assert verdict.score_tests[0].failed == () and verdict.score_tests[0].explained[0] > 0.5
@@ -364,14 +372,14 @@ def test_a_refit_that_blows_up_where_it_begins_is_left_out_and_named(monkeypatch
 
 
 @pytest.mark.slow
-def test_a_search_ends_where_all_that_was_asked_about_is_in_the_model():
+def test_a_search_ends_when_all_effects_are_in_the_model():
     scene, space = small_scene()
     verdict = searched(case_of(scene, space, library(scene, ["hinge_preload"]), replace(QUICK, max_effects=2)))
     assert verdict.effects == (PRELOAD,) and len(verdict.score_tests) == 1
 
 
 @pytest.mark.parametrize("fitted_further", [converged_model, polished])
-def test_what_blows_up_on_the_validation_motion_while_it_is_fitted_further_stays_unchanged(
+def test_a_model_is_unchanged_if_a_further_fit_blows_up_on_the_validation_motion(
     found: Small, monkeypatch: pytest.MonkeyPatch, fitted_further: Any
 ):
     def common(values: np.ndarray) -> np.ndarray:
@@ -382,31 +390,31 @@ def test_what_blows_up_on_the_validation_motion_while_it_is_fitted_further_stays
     refined = replace(found.base.refined, converged=False)
     model = replace(found.verdict.model, values=np.array([0.5]), refined=refined)
     whole, lost = (replace(model, values=np.array([x])) for x in (0.7, 1.5))
-    monkeypatch.setattr(search, "refit", lambda *arguments: whole)
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: whole)
     assert fitted_further(problem, model) == (whole, Notes())
-    monkeypatch.setattr(search, "refit", lambda *arguments: lost)
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: lost)
     kept, notes = fitted_further(problem, model)
     assert kept is model and len(notes.failed) == 1 and notes.failed[0].startswith(model.name)
 
 
-def test_what_has_converged_is_fitted_no_further(found: Small, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(search, "refit", lambda *arguments: pytest.fail("it has converged"))
+def test_a_converged_model_is_not_fitted_further(found: Small, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(candidate_fits, "refit", lambda *arguments: pytest.fail("it has converged"))
     assert converged_model(problem_of(found), found.verdict.model) == (found.verdict.model, Notes())
     assert polished(problem_of(found), found.base) == (found.base, Notes())  # no intervals to report
 
 
-def test_effects_without_locations_cannot_be_asked_about(found: Small):
+def test_effects_without_locations_are_refused(found: Small):
     nowhere = tuple(replace(e, locations={}) for e in found.case.effects)
     with pytest.raises(ValueError, match="none of the effects states its locations"):
         search_effects(replace(found.case, effects=nowhere), found.base, FLOOR)
 
 
-def test_where_nothing_blows_up_nothing_is_left_out(found: Small):
+def test_no_candidate_fails_in_the_small_scene(found: Small):
     asked = directions_of(candidates(found.case.effects))
     assert score_test(found.case.train, found.base, asked).failed == ()
 
 
-def test_a_nuisance_goes_no_further_than_its_prior_says(found: Small):
+def test_a_nuisance_is_bounded_by_its_prior(found: Small):
     p = found.case.base["torque_offset[elbow]"]
     assert (p.low, p.high) == (pytest.approx(-0.3), pytest.approx(0.3))  # of bounds of 2 and a deviation of 0.1
     assert found.case.config.selection.nuisance_bound == 3.0
@@ -435,7 +443,7 @@ def candidate(name: str, location: str = "door", **shapes: float) -> Candidate:
     return Candidate(name, location, (f"{name}[{location}]",), shapes)
 
 
-def test_an_effect_is_asked_about_elsewhere_with_the_shape_it_has():
+def test_other_locations_of_an_effect_have_its_shape():
     speeds = [candidate("ripple", place, periods=periods) for place in ("one", "two") for periods in (10.0, 20.0)]
     asked = directions_of([*speeds, candidate("latch", width=0.1)])
     model: Any = SimpleNamespace(parts=speeds[:1], coefficients=("ripple[one]",))
@@ -443,8 +451,8 @@ def test_an_effect_is_asked_about_elsewhere_with_the_shape_it_has():
     assert left == [candidate("ripple", "two"), candidate("latch", width=0.1)]
 
 
-def test_a_shape_stays_where_its_effect_does():
-    """A ripple asked about elsewhere has the count of the one in the model, and keeps it when that one goes."""
+def test_a_shape_parameter_remains_while_its_effect_does():
+    """A ripple at another location has the periods of the one in the model, and keeps them without it."""
     first = Candidate("ripple", "elbow", ("ripple_elbow",), {"periods": 48.0})
     second, drag = Candidate("ripple", "wrist", ("ripple_wrist",)), Candidate("drag", "hinge", ("drag",))
     assert without(first, (first, drag, second)) == (
@@ -455,8 +463,8 @@ def test_a_shape_stays_where_its_effect_does():
     assert without(drag, (first, drag)) == (first,)
 
 
-def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatch: pytest.MonkeyPatch):
-    """A damper keeps the simulation whole; drag takes next to nothing away and goes."""
+def test_a_part_is_kept_if_the_replay_blows_up_without_it(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """The replay needs the damper; drag has nearly no gain and is removed."""
     damper, drag = Candidate("closer", "hinge", ("closer",)), Candidate("drag", "hinge", ("drag",))
 
     def refit(train: Any, base: Any, parts: Any, starts: Any, config: Any) -> Any:
@@ -465,7 +473,7 @@ def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatc
         assert starts[0].tolist() == [2.0, 0.0]  # the drag at neutral
         return SimpleNamespace(parts=parts, keys=(damper.key,), values=starts[0], left=1.01)
 
-    monkeypatch.setattr(search, "refit", refit)
+    monkeypatch.setattr(candidate_fits, "refit", refit)
     monkeypatch.setattr(Problem, "discrepancy", lambda problem, model: model.left)
     whole = Space(tuple(Parameter(name, "N m", 0.0, 1.0, -5.0, 5.0) for name in ("closer", "drag")))
     case: Any = SimpleNamespace(full_space=whole, config=found.case.config, train=None, base=None)
@@ -477,7 +485,7 @@ def test_a_part_that_the_replay_cannot_do_without_stays(found: Small, monkeypatc
     assert pruned(problem, model) is model  # it takes 0.1 % of the base model's U
 
 
-def test_proposals_of_a_step_begin_at_the_model(found: Small, first: tuple[SearchState, SelectionStep]):
+def test_proposals_start_at_the_values_of_the_model(found: Small, first: tuple[SearchState, SelectionStep]):
     _, info = first
     ranked = proposals(info.score_test, found.base.residuals, found.case.full_space)
     assert [p.keys for p in ranked] == [p.keys for p in info.ranked]
@@ -486,14 +494,14 @@ def test_proposals_of_a_step_begin_at_the_model(found: Small, first: tuple[Searc
     assert [found.case.full_space.names[k] for k in moved] == list(ranked[0].sizes)
 
 
-def test_a_model_that_was_selected_has_converged(found: Small, first: tuple[SearchState, SelectionStep]):
+def test_a_selected_model_has_converged(found: Small, first: tuple[SearchState, SelectionStep]):
     state, _ = first
     model: FittedModel = state.model
     assert model.refined.converged
 
 
-def test_a_further_fit_that_does_not_arrive_leaves_the_converged_model(monkeypatch: pytest.MonkeyPatch):
-    """And is not said to have blown up; one that does arrive, or begins at an unfinished model, is taken."""
+def test_a_further_fit_that_does_not_converge_does_not_replace_a_converged_model(monkeypatch: pytest.MonkeyPatch):
+    """It is not reported as blown up.  A fit that converges, or continues an unfinished one, is taken."""
 
     def model(converged: bool, value: float = 1.0) -> Any:
         return SimpleNamespace(
@@ -508,7 +516,7 @@ def test_a_further_fit_that_does_not_arrive_leaves_the_converged_model(monkeypat
         (True, model(False, 2.0), False, Notes(not_tried=("a polished to the end",))),
         (True, model(True, np.nan), False, Notes(failed=("a polished",))),
     ):
-        monkeypatch.setattr(search, "_refit", lambda *_, after=after: after)
+        monkeypatch.setattr(candidate_fits, "search_refit", lambda *_, after=after: after)
         begun = model(before)
-        found, said = search.polished(problem, begun)
+        found, said = candidate_fits.polished(problem, begun)
         assert found is (after if taken else begun) and said == notes

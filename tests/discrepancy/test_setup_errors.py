@@ -1,4 +1,4 @@
-"""A base that leans, an encoder's zero, friction that holds: hidden in the robot, named by the search."""
+"""A tilted base, an encoder offset and friction at rest, hidden in the synthetic robot and named by the search."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def recorded(compensated: bool, hidden: tuple[tuple[str, float], ...]) -> dict[s
 
 
 def found_in(compensated: bool, folder: Path, **hidden: float) -> tuple[Verdict, dict[str, tuple[float, float, float]]]:
-    """The verdict, and of each parameter of the effects its value and 90 % interval."""
+    """The verdict, and parameter -> value and 90 % interval for the effects."""
     scene = arm(compensated)
     named = tuple((f"{name}[elbow]" if name == "encoder_zero" else name, size) for name, size in hidden.items())
     recordings = list(recorded(compensated, named).values())
@@ -103,8 +103,8 @@ def found_in(compensated: bool, folder: Path, **hidden: float) -> tuple[Verdict,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
-def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path):
-    """At what was hidden no more is left than where nothing is."""
+def test_effects_of_the_library_match_the_hidden_effects(compensated: bool, tmp_path: Path):
+    """With the hidden values the residual is no larger than that of a robot with nothing hidden."""
     scene = arm(compensated)
     effects = library(scene, ["encoder_offset", "gravity_direction"])
     space, cost, left = space_of(scene, tmp_path) + effect_space(effects), None, []
@@ -127,7 +127,7 @@ def test_the_effects_are_what_the_robot_hides(compensated: bool, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
-def test_an_encoders_zero_is_named_and_measured(compensated: bool, tmp_path: Path):
+def test_an_encoder_offset_is_named_with_its_size(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, encoder_zero=0.03)
     assert (verdict.conclusion, verdict.effects) == (Conclusion.NAMED, (EffectKey("encoder_offset", "elbow"),)), verdict
     value, low, high = spans["encoder_offset[elbow]"]
@@ -137,7 +137,7 @@ def test_an_encoders_zero_is_named_and_measured(compensated: bool, tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensated", [False, True], ids=["weight", "compensated"])
-def test_a_base_that_leans_is_named_and_measured(compensated: bool, tmp_path: Path):
+def test_a_tilted_base_is_named_with_its_angle(compensated: bool, tmp_path: Path):
     verdict, spans = found_in(compensated, tmp_path, tilted_base=0.03)
     assert verdict.conclusion is Conclusion.NAMED, verdict
     assert verdict.effects == (EffectKey("gravity_direction", "base"),)
@@ -148,8 +148,8 @@ def test_a_base_that_leans_is_named_and_measured(compensated: bool, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_sensors_gains_and_zeros_are_parameters_of_a_file(tmp_path: Path):
-    """What was hidden comes back as parameters, and is not asked about where it is one."""
+def test_sensor_gains_and_encoder_offsets_are_parameters_of_a_file(tmp_path: Path):
+    """Hidden values are fitted as parameters, which are then not tested as effects."""
     scene = arm(False)
     sensors = [
         {"sensor": "encoder_offset", "element": "elbow", "std": 0.02, "high": 0.1},

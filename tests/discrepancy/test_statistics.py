@@ -1,4 +1,4 @@
-"""Sign flips of whole repeats: exact where all are tried, no rejection where nothing is there; trends over repeats."""
+"""The tests by sign flips of whole repeats and of blocks of time: their arithmetic, level and power."""
 
 from __future__ import annotations
 
@@ -9,14 +9,22 @@ import pytest
 import scipy.stats
 from small_gap import largest_t
 
-from droid_jax.discrepancy.candidates import ScoreDirection, ScoreTest, trend
+from droid_jax.cost.noise import DEFAULT_NOISE, coarse_clock
+from droid_jax.discrepancy.candidates import ScoreDirection, ScoreTest, project, trend
+from droid_jax.discrepancy.config import BlocksConfig
 from droid_jax.discrepancy.statistics import (
+    OUTSIDE,
+    Blocks,
     Repeats,
     benjamini_hochberg,
+    block_length,
     detrended,
     detrended_discrepancy_p_values,
     discrepancies,
     discrepancy,
+    fewest_blocks,
+    in_turns,
+    interleaved,
     largest_detrended_t,
     largest_trend,
     one_sided_p,
@@ -25,6 +33,7 @@ from droid_jax.discrepancy.statistics import (
     t_values,
 )
 from droid_jax.model.effects.candidate import Candidate, EffectKey
+from droid_jax.recordings.split import FEWEST_REPEATS
 
 
 def test_all_flips_up_to_twelve_repeats():
@@ -46,7 +55,7 @@ def test_the_unflipped_t_is_students():
 
 
 def test_the_largest_t_keeps_its_level():
-    """1,000 times nothing, 30 correlated directions each: p < 0.05 in about 5 of 100."""
+    """1,000 draws of noise with 30 correlated directions each: p < 0.05 in about 5 of 100."""
     rng = np.random.default_rng(1)
     mixing = rng.normal(size=(30, 10))
     p = [largest_t(mixing @ rng.normal(size=(10, 8)))[1] for _ in range(1000)]
@@ -63,7 +72,7 @@ def test_a_trend_changes_no_largest_t():
 
 @pytest.mark.slow
 def test_without_a_trend_the_largest_t_keeps_its_level():
-    """3,000 times nothing, 40 independent directions each; with the degree of freedom forgotten 6.5 % lie below."""
+    """3,000 draws of noise with 40 independent directions each; without the degree of freedom 6.5 % have p < 0.05."""
     rng = np.random.default_rng(5)
     noise = [rng.normal(size=(40, 10)) for _ in range(3000)]
     p, forgotten = (np.array([of(scores)[1] for scores in noise]) for of in (
@@ -73,7 +82,7 @@ def test_without_a_trend_the_largest_t_keeps_its_level():
     assert np.mean(forgotten < 0.05) > np.mean(p < 0.05) + 0.008
 
 
-def test_the_largest_t_finds_what_is_there():
+def test_the_largest_t_finds_a_common_part():
     rng = np.random.default_rng(2)
     scores = rng.normal(size=(30, 10))
     scores[17] += 4.0
@@ -83,7 +92,7 @@ def test_the_largest_t_finds_what_is_there():
 
 
 def test_noise_does_not_bias_the_discrepancy():
-    """U of pure noise is zero on average; of a common part it is that part's mean square, whatever the noise."""
+    """U of noise is zero on average; U of a common part is its mean square for any noise."""
     rng = np.random.default_rng(3)
     common = rng.normal(0, 0.4, 200)
     none = [discrepancy(rng.normal(0, 3.0, (10, 200))) for _ in range(400)]
@@ -92,7 +101,7 @@ def test_noise_does_not_bias_the_discrepancy():
     assert np.mean(there) == pytest.approx(np.mean(common**2), abs=4 * np.std(there) / 20)
 
 
-def test_the_discrepancy_lies_where_it_was_put():
+def test_the_discrepancy_is_in_its_cell():
     rng = np.random.default_rng(4)
     residuals = rng.normal(size=(10, 300))
     residuals[:, 100:150] += 1.0
@@ -106,8 +115,8 @@ def test_the_discrepancy_lies_where_it_was_put():
 
 
 @pytest.mark.parametrize("noisy", [np.ones(8), np.r_[1.3, np.ones(7)], np.linspace(0.8, 1.2, 8)[::-1]])
-def test_a_small_discrepancy_everywhere_is_found_and_nothing_keeps_its_level(noisy: np.ndarray):
-    """What was taken out with the trend must not hide U = 0.02, nor make p of noise anything but uniform."""
+def test_a_small_discrepancy_is_found_and_noise_keeps_its_level(noisy: np.ndarray):
+    """Removing the trend hides no U = 0.02, and p-values of noise stay uniform."""
     rng, cell = np.random.default_rng(6), np.ones((1, 1400), bool)
     drift = 3.0 * (np.arange(8) - 3.5)[:, None]
     none, there = (
@@ -149,7 +158,7 @@ def test_resample_weights_draw_repeats_with_replacement():
 
 
 def test_resampled_losses_are_the_squared_means_of_resamples():
-    """What grows or fades steadily over the repeats is no scatter, as everywhere else: a trend changes nothing."""
+    """A trend over the repeats is no scatter and changes nothing."""
     rng, count = np.random.default_rng(7), 10
     commons, deviations = rng.normal(size=(2, 30)), rng.normal(size=(count, 30))
     deviations -= deviations.mean(axis=0)
@@ -190,7 +199,7 @@ TREND_REPEATS, TREND_SIZE = 10, 400
 
 
 def with_sensitivities(sensitivities: np.ndarray) -> ScoreTest:
-    """A score test with these sensitivities [K, M] and nothing else."""
+    """A score test with given sensitivities [K, M]."""
     names = [f"effect{k}" for k in range(len(sensitivities))]
     directions = tuple(ScoreDirection(Candidate(n, "hinge", (f"{n}_size",), {}), f"{n}_size") for n in names)
     none = np.zeros(len(sensitivities))
@@ -202,12 +211,12 @@ def sensitivities() -> np.ndarray:
     return 3.0 * np.random.default_rng(1).normal(size=(4, TREND_SIZE))
 
 
-def test_the_slope_that_was_put_in_is_that_of_its_candidate(sensitivities: np.ndarray):
+def test_the_slope_of_a_trend_is_that_of_its_candidate(sensitivities: np.ndarray):
     noise = np.random.default_rng(2).normal(size=(TREND_REPEATS, TREND_SIZE))
     rising = -0.02 * np.arange(TREND_REPEATS)[:, None] * sensitivities[2]
     found = trend(
         with_sensitivities(sensitivities), noise + rising + 5.0 * sensitivities[1]
-    )  # what repeats share is no trend
+    )  # a common part is no trend
     assert found is not None
     assert (found.key, found.coefficient) == (EffectKey("effect2", "hinge"), "effect2_size")
     assert found.per_repeat == pytest.approx(-0.02, abs=3 / (np.linalg.norm(sensitivities[2]) * np.sqrt(82.5)))
@@ -227,3 +236,118 @@ def test_without_a_trend_the_p_value_is_uniform(sensitivities: np.ndarray):
 def test_two_repeats_or_no_candidate_have_no_trend(sensitivities: np.ndarray):
     assert trend(with_sensitivities(sensitivities), np.zeros((2, TREND_SIZE))) is None
     assert trend(with_sensitivities(sensitivities[:0]), np.zeros((TREND_REPEATS, TREND_SIZE))) is None
+
+
+# Blocks of time in place of repeats --------------------------------------------------------
+
+
+def test_blocks_of_two_parts_alternate():
+    clock = coarse_clock(0.0, 30.0)
+    parts = interleaved(clock, 0.0, 20.0, 1.0, 2)
+    assert parts.shape == (2, len(clock)) and parts.max() == 9
+    assert np.all((parts[0] == OUTSIDE) | (parts[1] == OUTSIDE))
+    assert np.all((parts.max(axis=0) == OUTSIDE) == (clock >= 20.0))
+    for part in parts:
+        for block in range(10):
+            at = np.flatnonzero(part == block)
+            assert np.all(np.diff(at) == 1) and len(at) >= 1.0 * DEFAULT_NOISE.rate - 1
+
+
+def test_blocks_of_both_parts_are_numbered_in_order_of_time():
+    clock = coarse_clock(0.0, 30.0)
+    train, validation = interleaved(clock, 0.0, 20.0, 1.0, 2)
+    both = in_turns([train, validation])
+    assert np.all((both == OUTSIDE) == (clock >= 20.0)) and np.all(np.diff(both[both != OUTSIDE]) >= 0)
+    for part in (train, validation):
+        assert len({*both[part != OUTSIDE].tolist()}) == 10
+        for block in range(10):
+            assert len({*both[part == block].tolist()}) == 1
+    assert both.max() == 19
+
+
+@pytest.mark.parametrize(("share", "needed"), [(1.0, 32.0), (2 / 3, 48.0)])
+def test_the_error_of_a_short_log_states_the_length_it_needs(share: float, needed: float):
+    """A log of the stated length is long enough, also if a part of it is test data."""
+    with pytest.raises(ValueError, match=f"record for {needed:g} s"):
+        interleaved(coarse_clock(0.0, 30.0), 0.0, 20.0, 2.0, 2, share)
+    clock = coarse_clock(0.0, needed)
+    assert interleaved(clock, 0.0, share * needed + 1e-6, 2.0, 2, share).max() == 7
+    with pytest.raises(ValueError, match=f"4 are needed .* record for {needed / 2:g} s"):
+        interleaved(coarse_clock(0.0, 12.0), 0.0, 12.0, 2.0, 2, share, 4)
+
+
+def test_fits_that_are_not_tested_have_as_few_blocks_as_allowed():
+    clock = coarse_clock(0.0, 30.0)
+    block = fewest_blocks(clock, 10.0)
+    assert block.max() + 1 == FEWEST_REPEATS and np.all((block == OUTSIDE) == (clock < 10.0))
+
+
+def test_blocks_are_longer_than_the_correlation():
+    rng, config = np.random.default_rng(0), BlocksConfig()
+    white = rng.normal(size=(4000, 1))
+    slow = np.convolve(white[:, 0], np.ones(20))[:4000, None]  # correlated for one second
+    assert block_length(white, config) == config.shortest == 0.5
+    assert block_length(slow, config) == pytest.approx(1.5, rel=0.3)
+    longer = BlocksConfig(correlation_times=3.0, shortest=0.7)
+    assert block_length(slow, longer) == pytest.approx(2.0 * block_length(slow, config))
+    assert block_length(white, longer) == 0.7
+
+
+COLUMNS = 2
+
+
+def made_blocks(count: int = 8, size: int = 25, columns: int = COLUMNS) -> Blocks:
+    """Blocks with a tail that belongs to none."""
+    return Blocks(np.tile(np.r_[np.repeat(np.arange(count), size), np.full(10, OUTSIDE)], columns))
+
+
+def test_rows_are_blocks_and_their_mean_the_residual():
+    made, rng = made_blocks(), np.random.default_rng(1)
+    common = rng.normal(size=len(made.block))
+    rows = made.residuals(common)
+    inside = made.block != OUTSIDE
+    np.testing.assert_array_equal(made.counted, inside)
+    np.testing.assert_allclose(rows.mean(axis=0), np.where(inside, common, 0.0))
+    assert not made.repeated and made.units == len(rows) == 8 and made.size == inside.sum()
+    assert made.discrepancy(rows) == pytest.approx(np.mean(common[inside] ** 2))
+    first = np.arange(len(common)) < len(common) // COLUMNS
+    np.testing.assert_allclose(made.discrepancies(rows, first[None]), np.mean(common[inside & first] ** 2))
+    np.testing.assert_array_equal(made.cell_p_values(rows, first[None]), [1.0])
+    losses = made.losses(np.stack([common, 2 * common]), np.full((1, 8), 1 / 8))
+    np.testing.assert_allclose(losses[0], np.sum(common[inside] ** 2) * np.array([1.0, 4.0]))
+    draws = resample_weights(8, draws=400, seed=0)
+    by_hand = draws @ [8 * np.sum(common[made.block == b] ** 2) for b in range(8)]
+    np.testing.assert_allclose(made.losses(common[None], draws)[:, 0], by_hand)
+
+
+# Level and power of the test ---------------------------------------------------------------
+
+
+def p_values(count: int, present: float) -> np.ndarray:
+    """[count, 2] p-values after a fit of 24 smooth columns: of blocks, and of plain flips.
+
+    present: how much of one of the 30 sensitivities the data hold.
+    """
+    made, rng = made_blocks(columns=1), np.random.default_rng(2)
+    inside, out = made.block != OUTSIDE, []
+    prior = np.full(24, 10.0)
+    for _ in range(count):
+        base = rng.normal(size=(len(inside), 24)) * inside[:, None]
+        raw = rng.normal(size=(30, len(inside))) * inside * rng.gamma(0.5, size=9)[made.block]
+        noise = (present * raw[0] + rng.normal(size=len(inside))) * inside
+        left, projected = project(noise[None], base, prior)[0], project(raw, base, prior)
+        scores = projected @ made.residuals(left).T
+        out.append((made.largest_score(scores, projected, base, prior)[1], largest_t(scores)[1]))
+    return np.array(out)
+
+
+def test_blocks_keep_their_level_after_a_fit():
+    p = p_values(400, 0.0)
+    assert np.mean(p[:, 0] < 0.05) < 0.08
+
+
+def test_an_effect_in_few_blocks_is_found():
+    """Student's t of such blocks does not grow with the effect; the standardised score does."""
+    p = p_values(40, 3.0)
+    assert np.mean(p[:, 0] < 0.01) > 0.8
+    assert np.mean(p[:, 1] < 0.01) < 0.5

@@ -1,4 +1,4 @@
-"""The validation test of an effect: every reason against it, and none where it is right."""
+"""The validation test of an effect: every reason against it, and none against the true effect."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from small_gap import FLOOR, Small, small
 
-from droid_jax.discrepancy import fitting, selection
+from droid_jax.discrepancy import posterior, selection
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, consistent_with_zero, deviations, intervals, refit
-from droid_jax.discrepancy.selection import Reason, ValidationTest, much_more, validation_tests, zero_warning
+from droid_jax.discrepancy.fitting import FittedModel, refit
+from droid_jax.discrepancy.posterior import consistent_with_zero, deviations, intervals
+from droid_jax.discrepancy.selection import Reason, ValidationTest, reduced_enough, validation_tests, zero_warning
 from droid_jax.discrepancy.statistics import Repeats, detrended
 from droid_jax.identify.identifiability import posterior_of
 from droid_jax.identify.search import NotReplayed
@@ -31,7 +32,7 @@ def found() -> Small:
 
 
 def extended(found: Small, key: EffectKey) -> FittedModel:
-    """The base model with one effect, refitted."""
+    """The refitted model with one effect."""
     case = found.case
     part = next(c for c in candidates(case.effects) if c.key == key)
     return refit(case.train, case.base, (part,), found.base.values[None], case.config.refit)
@@ -41,7 +42,7 @@ def on_validation(
     found: Small, *models: FittedModel, validation: ResidualSet | None = None, before: FittedModel | None = None,
     u0: float = FLOOR, **minimum_sizes: float,
 ) -> list[ValidationTest]:  # fmt: skip
-    """The models beside the base model."""
+    """Validation tests of models that extend the base model."""
     case = found.case
     on = case.validation if validation is None else validation
     whole = on.discrepancy_at(found.base.values)
@@ -69,7 +70,7 @@ def test_an_effect_below_the_minimum_size_is_weak(found: Small):
 
 
 def test_a_coefficient_at_its_neutral_bound_may_be_zero(found: Small):
-    """What is said of it and its interval are one statement: zero lies in the interval, or it is not zero."""
+    """The reason and the interval agree: zero is in the interval or the coefficient is not zero."""
     model = extended(found, PRELOAD)
     (name,) = model.coefficients
     at, deviation = found.case.full_space.index(name), deviations(found.case.train, model)[name]
@@ -97,8 +98,8 @@ def test_the_level_of_the_intervals_is_configured(found: Small):
     assert not consistent_with_zero(with_config(train, interval_level=0.5), moved, part)
 
 
-def test_coefficients_that_may_all_be_zero_have_intervals_that_say_so(found: Small, monkeypatch: pytest.MonkeyPatch):
-    """1.8 deviations off, one alone is within chance of two and its own interval would leave zero out; both are not."""
+def test_intervals_of_coefficients_that_may_all_be_zero_reach_zero(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """One at 1.8 deviations is consistent with zero in a joint test of two; its single interval excludes zero."""
     model = extended(found, PAYLOAD)
     (part,) = model.parts
     assert len(part.coefficients) == 2
@@ -109,7 +110,7 @@ def test_coefficients_that_may_all_be_zero_have_intervals_that_say_so(found: Sma
     cov = true.cov.copy()
     cov[at], cov[:, at] = 0.0, 0.0
     cov[at, at] = 1.0
-    monkeypatch.setattr(fitting, "posterior_of", lambda *args: replace(true, cov=cov))
+    monkeypatch.setattr(posterior, "posterior_of", lambda *args: replace(true, cov=cov))
     space, values = found.case.full_space, model.values.copy()
     for name, off, zero in ((part.coefficients, 1.8, False), (part.coefficients[:1], 1.8, True)):
         values[[space.index(a) for a in part.coefficients]] = 0.0
@@ -123,16 +124,16 @@ def test_coefficients_that_may_all_be_zero_have_intervals_that_say_so(found: Sma
 
 
 @pytest.mark.parametrize(("signs", "zero"), [((1.2, 1.2), False), ((1.2, -1.2), True), ((0.0, 2.0), False)])
-def test_of_two_coefficients_that_trade_each_may_be_zero_and_not_both(
+def test_two_correlated_coefficients_may_each_be_zero_but_not_both(
     found: Small, monkeypatch: pytest.MonkeyPatch, signs: tuple[float, float], zero: bool
 ):
-    """Posterior deviations of one, correlation -0.99: their sum is known to a tenth of a deviation."""
+    """Posterior deviations of one and correlation -0.99: their sum is known to a tenth of a deviation."""
     model = extended(found, PAYLOAD)
     (part,) = model.parts
     at = [model.space.index(a) for a in part.coefficients]
     cov = np.eye(len(model.space))
     cov[np.ix_(at, at)] = [[1.0, -0.99], [-0.99, 1.0]]
-    monkeypatch.setattr(fitting, "posterior_of", lambda *args: SimpleNamespace(cov=cov))
+    monkeypatch.setattr(posterior, "posterior_of", lambda *args: SimpleNamespace(cov=cov))
     space, values = found.case.full_space, model.values.copy()
     for name, sign in zip(part.coefficients, signs, strict=True):
         values[space.index(name)] = space[name].mean + sign * space[name].std
@@ -140,7 +141,7 @@ def test_of_two_coefficients_that_trade_each_may_be_zero_and_not_both(
 
 
 @pytest.mark.parametrize("side", ["high", "low"])
-def test_a_coefficient_at_its_other_bound_has_run_into_it(found: Small, side: str):
+def test_a_coefficient_at_a_bound_other_than_neutral_is_rejected(found: Small, side: str):
     model = extended(found, PRELOAD)
     (name,) = model.coefficients
     values, p = model.values.copy(), found.case.full_space[name]
@@ -156,8 +157,8 @@ def test_a_coefficient_at_its_other_bound_has_run_into_it(found: Small, side: st
     assert Reason.AT_BOUND not in reasons(free)
 
 
-def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):
-    """The same mean gain, in repeats that differ by fifty times as much."""
+def test_a_gain_that_scatters_over_the_repeats_is_not_confirmed(found: Small):
+    """The mean gain is unchanged; it scatters fifty times more over the repeats."""
     validation, model = found.case.validation, extended(found, PRELOAD)
     assert isinstance(validation.resampling, Repeats)
     loud = replace(validation, resampling=Repeats(50 * validation.resampling.deviations))
@@ -168,13 +169,13 @@ def test_what_the_repeats_do_not_agree_on_is_not_confirmed(found: Small):
     assert lenient.passed and lenient.p == test.p
 
 
-def test_a_further_effect_must_take_more_than_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
-    """Half-way to what it would take: enough for the first effect of a model, too little for a second."""
+def test_a_further_effect_needs_a_larger_gain_than_the_first(found: Small, monkeypatch: pytest.MonkeyPatch):
+    """Half of its gain is enough for the first effect of a model and too little for a second."""
     monkeypatch.setattr(
         selection, "remaining_discrepancy", lambda fit, other, model: other.discrepancy_at(model.values)
     )  # a certain fit
     case, model = found.case, extended(found, PRELOAD)
-    share = 1 - np.sqrt(0.7)  # U is square in what is left
+    share = 1 - np.sqrt(0.7)  # U is quadratic in the residual
     values = (1 - share) * found.base.values + share * model.values
     some = replace(model, values=values)
     assert 0.6 < case.validation.discrepancy_at(values) / case.validation.discrepancy_at(found.base.values) < 0.8
@@ -185,8 +186,8 @@ def test_a_further_effect_must_take_more_than_the_first(found: Small, monkeypatc
     assert Reason.SMALL_GAIN in reasons(strict)
 
 
-def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small):
-    """Were they not alike: the right preload against one that is a third too small."""
+def test_a_model_that_is_rarely_best_in_the_resamples_is_rejected(found: Small):
+    """The true preload against one that is a third too small, without the rule for indistinguishable models."""
     case, right = found.case, extended(found, PRELOAD)
     values = right.values.copy()
     values[case.full_space.index("hinge_preload")] *= 2 / 3
@@ -199,20 +200,22 @@ def test_one_that_another_beats_in_the_resamples_is_not_named(found: Small):
 
 
 @pytest.mark.parametrize(
-    ("after", "beside", "beyond", "enough"),
+    ("after", "u_before", "u_after", "enough"),
     [
-        (0.55, None, None, True),  # U says enough
+        (0.55, None, None, True),  # U falls enough
         (1.1, None, None, False),
-        (0.7, 0.3, 0.05, True),  # most of what stays, stays since the fit is uncertain
+        (0.7, 0.3, 0.05, True),  # most of the remaining U is within the uncertainty of the fit
         (0.7, 0.3, 0.25, False),
-        (0.7, 0.01, -0.01, False),  # nothing was left beyond that
+        (0.7, 0.01, -0.01, False),  # nothing remained beyond that uncertainty
     ],
 )
-def test_a_further_effect_takes_its_share(after: float, beside: float | None, beyond: float | None, enough: bool):
+def test_a_further_effect_reduces_the_discrepancy_enough(
+    after: float, u_before: float | None, u_after: float | None, enough: bool
+):
     def asked(value: float | None) -> float:
         return pytest.fail("was not to be asked") if value is None else value
 
-    assert much_more(1.0, after, lambda: asked(beside), lambda: asked(beyond), 2.0, SelectionConfig()) is enough
+    assert reduced_enough(1.0, after, lambda: asked(u_before), lambda: asked(u_after), 2.0, SelectionConfig()) is enough
 
 
 @pytest.mark.slow
@@ -229,7 +232,7 @@ def test_a_further_effect_takes_its_share(after: float, beside: float | None, be
     ],
 )
 def test_reasons_of_the_discrepancy(found: Small, left: float, base: float, u0: float, reason: Reason | None):
-    """A model that leaves a share `left` of what it extends; base: U of the base model in units of that."""
+    """left: U of the model as a share of the one that it extends; base: U of the base model in the same unit."""
     case, model = found.case, extended(found, PRELOAD)
     before = case.validation.discrepancy_at(found.base.values)
     common = case.validation.common(found.base.values)[0]
@@ -243,7 +246,7 @@ def test_reasons_of_the_discrepancy(found: Small, left: float, base: float, u0: 
     assert set(reasons(test)) & GAINS == ({reason} if reason else set())
 
 
-def test_a_model_that_blows_up_on_the_validation_motion_loses(found: Small):
+def test_a_model_that_blows_up_on_the_validation_motion_is_rejected(found: Small):
     case, model = found.case, extended(found, PRELOAD)
     wild, replayed = replace(model, values=model.values + 1.0), case.validation.whitened
 
@@ -260,8 +263,8 @@ def test_a_model_that_blows_up_on_the_validation_motion_loses(found: Small):
     assert Reason.REPLAY_FAILED in reasons(worse)
 
 
-def test_a_gain_that_fades_steadily_is_significant_and_chance_is_not(found: Small):
-    """A friction that warms up: its mean helps every repeat but by less and less, in the end not at all."""
+def test_a_gain_with_a_trend_is_significant_and_noise_is_not(found: Small):
+    """A friction that warms up: the gain of its mean falls over the repeats, down to none."""
     rng = np.random.default_rng(0)
     fading = np.linspace(9.0, -1.0, 10) + 0.1 * rng.normal(size=10)
     p_value = found.case.validation.resampling.gain_p_value

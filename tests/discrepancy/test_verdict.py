@@ -1,4 +1,4 @@
-"""What a search concludes: from its models and steps to the answer, and the answer in words."""
+"""The verdict of a search: from its models and steps to the conclusion, and the conclusion in words."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ import pytest
 from small_gap import FLOOR, Small, problem_of, small
 
 from droid_jax.discrepancy import search
+from droid_jax.discrepancy.candidate_fits import Notes
 from droid_jax.discrepancy.case import Case
 from droid_jax.discrepancy.config import SelectionConfig
-from droid_jax.discrepancy.fitting import FittedModel, remaining_discrepancy
+from droid_jax.discrepancy.fitting import FittedModel
+from droid_jax.discrepancy.posterior import remaining_discrepancy
 from droid_jax.discrepancy.results import gap_json
-from droid_jax.discrepancy.search import Notes, SearchState, search_effects, selection_step
+from droid_jax.discrepancy.search import SearchState, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import Repeats
-from droid_jax.discrepancy.verdict import LOST, Conclusion, Verdict, closes_too_little, conclude, worsened
+from droid_jax.discrepancy.verdict import Conclusion, Verdict, closes_too_little, conclude, worsened
+from droid_jax.files import LOST
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys
 
@@ -37,17 +40,17 @@ def steps(found: Small) -> tuple[SelectionStep, ...]:
 
 
 def with_thresholds(case: Case, **thresholds: float) -> Case:
-    """The case with other thresholds, everywhere where they are kept."""
+    """The case with other thresholds in all its residual sets."""
     selection = replace(case.config.selection, **thresholds)
     config = replace(case.config, selection=selection)
     sets = {role: replace(e, config=selection) for role, e in case.residual_sets.items()}
     return replace(case, config=config, **sets)
 
 
-# Fits that say nothing ----------------------------------------------------------------------
+# Fits without a conclusion ----------------------------------------------------------------------
 
 
-def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
+def test_there_is_no_conclusion_if_the_base_fit_did_not_converge(found: Small):
     base = replace(found.base, refined=replace(found.base.refined, converged=False))
     verdict = search_effects(found.case, base, FLOOR)
     assert verdict.conclusion is Conclusion.UNCONVERGED
@@ -56,7 +59,7 @@ def test_no_verdict_from_a_base_fit_that_did_not_converge(found: Small):
     assert "the base model did not converge" in verdict.sentence
 
 
-def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_is_named_if_the_fit_with_effects_did_not_converge(found: Small, monkeypatch: pytest.MonkeyPatch):
     def unconverged(problem: Any, model: FittedModel) -> tuple[FittedModel, Notes]:
         return replace(model, refined=replace(model.refined, converged=False)), Notes()
 
@@ -66,25 +69,25 @@ def test_no_name_from_an_extended_fit_that_did_not_converge(found: Small, monkey
     assert "the model with the effects" in verdict.sentence
     assert (verdict.effects, verdict.indistinguishable, verdict.indistinguishable_models) == ((), (), ())
     assert verdict.model is found.base
-    assert any(test.passed for test in verdict.validation_tests)  # the grounds are told
+    assert any(test.passed for test in verdict.validation_tests)  # the tests are in the verdict
 
 
 def test_a_discrepancy_below_the_discretisation_error_is_none(found: Small):
-    """The test rejects, yet the time step alone would leave as much."""
+    """The score test rejects, but the error of the time step is as large."""
     verdict = search_effects(found.case, found.base, 2.0 * found.base.discrepancy)
     assert verdict.conclusion is Conclusion.NONE
     assert verdict.score_tests[0].p < found.case.config.selection.significance
     assert not verdict.effects and np.isfinite(verdict.closed("validation"))
 
 
-def test_a_discrepancy_that_an_error_of_first_order_could_leave_is_none(found: Small):
-    """A quarter of the step leaves a quarter of such an error: U0 shows nine sixteenths of its U."""
+def test_a_discrepancy_within_an_error_of_first_order_is_none(found: Small):
+    """A quarter of such an error remains at a quarter of the step, so U0 is nine sixteenths of its U."""
     assert search_effects(found.case, found.base, 0.6 * found.base.discrepancy).conclusion is Conclusion.NONE
     assert search_effects(found.case, found.base, 0.5 * found.base.discrepancy).conclusion is not Conclusion.NONE
 
 
-def test_a_test_motion_that_blows_up_is_left_out_and_said_so(found: Small, steps: tuple[SelectionStep, ...]):
-    """It is opened when hours of search are over, which must not be lost."""
+def test_a_test_motion_that_blows_up_is_left_out_and_reported(found: Small, steps: tuple[SelectionStep, ...]):
+    """It is replayed at the end of a search of hours, whose result must not be lost."""
 
     def discrepancy_at(values: np.ndarray) -> float:
         raise NotReplayed("the simulation of 'test' blows up")
@@ -95,12 +98,12 @@ def test_a_test_motion_that_blows_up_is_left_out_and_said_so(found: Small, steps
     assert verdict.conclusion is Conclusion.NAMED
 
 
-# What remains -------------------------------------------------------------------------------
+# Remainders -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Known(Repeats):
-    """Repeats of which every U and every p-value is known."""
+    """Repeats with a given U and a given p-value."""
 
     p: float
 
@@ -115,15 +118,15 @@ class Known(Repeats):
     ("exhausted", "p", "open_share", "remains"),
     [
         (True, 0.001, 0.1, True),
-        (True, 0.5, 0.1, False),  # chance would leave as much
+        (True, 0.5, 0.1, False),  # not significant
         (False, 0.5, 0.1, True),  # a score test found more
-        (True, 0.001, 1.0, False),  # no more than the share that counts as closed
+        (True, 0.001, 1.0, False),  # below the open share
     ],
 )
-def test_what_is_left_counts_where_chance_would_not_leave_it(
+def test_a_large_and_significant_remainder_counts(
     found: Small, steps: tuple[SelectionStep, ...], exhausted: bool, p: float, open_share: float, remains: bool
 ):
-    """A remainder that no candidate looks like is one: a share of U, and seen by every repeat."""
+    """A remainder may resemble no candidate: it counts by its share of U and its significance over the repeats."""
     case = with_thresholds(found.case, open_share=open_share, minimum_closed=0.0)
     assert isinstance(case.validation.resampling, Repeats)
     known = Known(case.validation.resampling.deviations, p)
@@ -133,7 +136,7 @@ def test_what_is_left_counts_where_chance_would_not_leave_it(
     assert verdict.conclusion is (Conclusion.PARTLY if remains else Conclusion.NAMED)
 
 
-LITTLE = {"train": (4.0, 2.0), "validation": (4.0, 2.8), "test": (3.0, 2.07)}  # closes 30 and 31 % of held-out data
+LITTLE = {"train": (4.0, 2.0), "validation": (4.0, 2.8), "test": (3.0, 2.07)}  # explains 30 and 31 % of held-out data
 
 
 @pytest.mark.parametrize(
@@ -141,9 +144,9 @@ LITTLE = {"train": (4.0, 2.0), "validation": (4.0, 2.8), "test": (3.0, 2.07)}  #
     [
         (Conclusion.PARTLY, LITTLE, 0.4, True),
         (Conclusion.PARTLY, LITTLE, 0.25, False),
-        (Conclusion.PARTLY, {**LITTLE, "validation": (4.0, 0.8)}, 0.4, True),  # the test motion alone says so
+        (Conclusion.PARTLY, {**LITTLE, "validation": (4.0, 0.8)}, 0.4, True),  # by the test motion alone
         (Conclusion.PARTLY, {**LITTLE, "test": (3.0, 0.3)}, 0.4, True),
-        # What was fitted decides nothing.
+        # The training recording does not count.
         (Conclusion.PARTLY, {"train": (4.0, 3.6), "validation": (4.0, 0.8)}, 0.4, False),
         # No discrepancy in the test recording.
         (
@@ -152,11 +155,11 @@ LITTLE = {"train": (4.0, 2.0), "validation": (4.0, 2.8), "test": (3.0, 2.07)}  #
             0.4,
             False,
         ),
-        (Conclusion.NAMED, LITTLE, 0.4, False),  # nothing significant is left
+        (Conclusion.NAMED, LITTLE, 0.4, False),  # no significant remainder
         (Conclusion.INDISTINGUISHABLE, LITTLE, 0.4, False),
     ],
 )
-def test_beside_a_remainder_a_name_needs_its_share_of_held_out_data(
+def test_beside_a_remainder_effects_must_explain_their_share_of_held_out_data(
     found: Small, conclusion: Conclusion, discrepancies: dict[str, tuple[float, float]], least: float, little: bool
 ):
     config = replace(found.verdict.config, minimum_closed=least)
@@ -165,13 +168,13 @@ def test_beside_a_remainder_a_name_needs_its_share_of_held_out_data(
 
 
 def a_third(found: Small) -> FittedModel:
-    """The extended model, a sixth of the way from the base model: it closes 31 % of U, which is square in the rest."""
+    """A model a sixth of the way from the base model to the extended one: it explains 31 % of U, which is quadratic."""
     share = 1 - np.sqrt(0.69)
     return replace(found.verdict.model, values=(1 - share) * found.base.values + share * found.verdict.model.values)
 
 
-def test_a_name_for_a_third_of_a_discrepancy_is_a_hint(found: Small, steps: tuple[SelectionStep, ...]):
-    """An effect that passed, a significant remainder, and a third closed on the held-out motion: unexplained."""
+def test_an_effect_that_explains_a_third_is_a_hint(found: Small, steps: tuple[SelectionStep, ...]):
+    """An effect that passed and explains a third of a held-out motion beside a significant remainder: unexplained."""
     assert found.case.config.selection.minimum_closed == 0.4
     verdict = conclude(found.case, found.base, a_third(found), steps, FLOOR)
     assert verdict.conclusion is Conclusion.UNEXPLAINED and verdict.model is found.base
@@ -184,7 +187,7 @@ def test_a_name_for_a_third_of_a_discrepancy_is_a_hint(found: Small, steps: tupl
     assert hint.effects == (PRELOAD,) and hint.indistinguishable == ((),)
     assert hint.closed == {"validation": pytest.approx(0.31, abs=0.08)}
     assert verdict.sentence.endswith(f"{PRELOAD} (closes {hint.closed['validation']:.0%}).")
-    assert any(test.passed for test in verdict.validation_tests)  # the grounds are told
+    assert any(test.passed for test in verdict.validation_tests)  # the tests are in the verdict
 
 
 def test_a_threshold_set_from_python_changes_the_verdict_and_is_in_the_file(
@@ -204,12 +207,12 @@ def test_a_threshold_set_from_python_changes_the_verdict_and_is_in_the_file(
 
 
 def at_door(names: str) -> Keys:
-    """Keys of effects of one letter each."""
+    """Keys of effects named by one letter each."""
     return tuple(EffectKey(name, "door") for name in names)
 
 
 def made_up(found: Small, names: str) -> FittedModel:
-    """A model with these effects, which have no coefficients."""
+    """A model with effects without coefficients."""
     return replace(found.verdict.model, parts=tuple(Candidate(name, "door", ()) for name in names))
 
 
@@ -218,7 +221,7 @@ def passing(names: str, *alike: str) -> ValidationTest:
 
 
 def selecting(found: Small, before: str, winner: str, *alike: str) -> SelectionStep:
-    """A step: effects that stood, that won, and that are indistinguishable from these."""
+    """A step with the effects before it, the selected ones, and those indistinguishable from these."""
     models = (winner, *alike)
     return SelectionStep(
         found.verdict.score_tests[0], at_door(before), (), tuple(made_up(found, names) for names in models),
@@ -228,7 +231,7 @@ def selecting(found: Small, before: str, winner: str, *alike: str) -> SelectionS
 
 
 def alternatives(found: Small, names: str, *made: SelectionStep) -> dict[str, set[str]]:
-    """Of a model with these effects: effect -> its alternatives, one letter an effect."""
+    """Effect -> alternatives of a model, one letter for each effect."""
     verdict = conclude(found.case, found.base, made_up(found, names), made, FLOOR)
     each = zip(verdict.effects, verdict.indistinguishable, strict=True)
     return {key.effect: {"".join(k.effect for k in keys) for keys in others} for key, others in each}
@@ -242,17 +245,17 @@ def test_alternatives_are_those_of_the_last_step_that_selected_an_effect(found: 
     assert alternatives(found, "a", first, lost) == {"a": {"x"}}
 
 
-def test_an_effect_of_the_model_is_no_alternative_to_another(found: Small):
+def test_an_effect_of_the_model_is_no_alternative_to_another_one(found: Small):
     first, second = selecting(found, "", "a", "b", "x"), selecting(found, "a", "ab")
     assert alternatives(found, "ab", first, second) == {"a": {"x"}, "b": set()}
 
 
-def test_an_alternative_without_any_of_the_models_effects_is_named_whole(found: Small):
+def test_an_alternative_to_several_effects_is_listed_for_each(found: Small):
     assert alternatives(found, "ab", selecting(found, "", "ab", "ce")) == {"a": {"ce"}, "b": {"ce"}}
     assert alternatives(found, "ab", selecting(found, "", "ab", "c")) == {"a": {"c"}, "b": {"c"}}
 
 
-def test_alternatives_make_an_answer_of_its_own_and_their_models_come_along(found: Small):
+def test_alternatives_make_the_verdict_indistinguishable_and_their_models_are_in_it(found: Small):
     made = selecting(found, "", "a", "x")
     rejected = replace(made.tests[1], reasons=(Rejection(Reason.RARELY_BEST, ""),))
     verdict = conclude(found.case, found.base, made_up(found, "a"), (made,), FLOOR)
@@ -284,7 +287,7 @@ def keys(*names: str) -> tuple[Keys, ...]:
         ),
     ],
 )
-def test_the_sentence_keeps_what_is_certain(found: Small, alternatives: Any, said: str):
+def test_the_sentence_separates_certain_effects_from_alternatives(found: Small, alternatives: Any, said: str):
     conclusion = Conclusion.INDISTINGUISHABLE if any(alternatives) else Conclusion.NAMED
     verdict = replace(found.verdict, conclusion=conclusion, effects=at_door("ab"), indistinguishable=alternatives)
     assert verdict.sentence == said
@@ -311,7 +314,7 @@ def rejected(test: ValidationTest, *reasons: Reason) -> ValidationTest:
         (Reason.NOT_CONFIRMED, "{name}, not confirmed by the validation recording"),
     ],
 )
-def test_what_lost_for_one_reason_alone_is_said(found: Small, reason: Reason, why: str):
+def test_a_model_rejected_for_one_reason_alone_is_in_the_sentence(found: Small, reason: Reason, why: str):
     verdict = replace(found.verdict, conclusion=Conclusion.UNEXPLAINED, effects=(), indistinguishable=())
     nothing = "The model lacks something that is not in the library."
     assert verdict.sentence == nothing
@@ -330,12 +333,16 @@ def test_doubts_end_the_sentence(found: Small):
     assert doubted.sentence == f"{found.verdict.sentence} But it is large. But its form does not fit."
 
 
-def test_a_test_recording_that_is_matched_worse_is_a_doubt(found: Small):
+def test_a_worse_match_of_the_test_recording_is_a_doubt(found: Small):
     """Friction fitted at low gains let a servo stick at a higher one, and the verdict did not say so."""
     model = found.verdict.model
     assert model.parts and found.verdict.doubts == ()
     config = SelectionConfig()
-    assert worsened({"test": (1.0, 1.1)}, model, config) == worsened({"validation": (0.1, 0.2)}, model, config) == ()
-    assert worsened({"test": (0.1, 0.2)}, replace(model, parts=()), config) == ()
-    (said,) = worsened({"test": (0.1155, 1.0168)}, model, config)
+    assert worsened({"test": (1.0, 1.1)}, model, 0.0, config) == ()
+    assert worsened({"validation": (0.1, 0.2)}, model, 0.0, config) == ()
+    assert worsened({"test": (0.1, 0.2)}, replace(model, parts=()), 0.0, config) == ()
+    (said,) = worsened({"test": (0.1155, 1.0168)}, model, 0.01, config)
     assert said == "the test recording is matched worse with it, U 0.116 before and 1.02 after"
+    # A U about zero, below the discretisation error, was called worse.
+    assert worsened({"test": (-0.001, 0.005)}, model, 0.01, config) == ()
+    assert len(worsened({"test": (-0.001, 0.05)}, model, 0.01, config)) == 1

@@ -1,4 +1,4 @@
-"""Commanded logs with few repeats: where windows begin, what they leave, their blocks, and a search in one log."""
+"""Commanded logs with few repeats: initial states of windows, residuals, blocks, and a search in one log."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ from pendulum import TRUE, pendulum, swung
 from two_link import JOINTS, arm, measured, recording
 
 import droid_jax as dj
+from droid_jax.cost.cost import Cost
 from droid_jax.cost.log_piece import shared_steps
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.cost.windowed_log import WindowedLog, _whitener, windowed_log
 from droid_jax.discrepancy import log_case
-from droid_jax.discrepancy.candidates import SMALL, observable_effects
-from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig
+from droid_jax.discrepancy.candidates import observable_effects
+from droid_jax.discrepancy.case import Case, block_residual_set
+from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
 from droid_jax.discrepancy.log_case import planned
 from droid_jax.discrepancy.statistics import OUTSIDE
 from droid_jax.discrepancy.verdict import Conclusion
@@ -54,17 +56,17 @@ def space(tmp_path_factory: pytest.TempPathFactory) -> Space:
 
 @pytest.fixture
 def seconds() -> Iterator[None]:
-    """Logs of this test are longer."""
+    """Longer logs for a test."""
     before, made.SECONDS = made.SECONDS, 26.0
     yield
     made.SECONDS = before
 
 
-# ----- where a window begins
+# ----- initial states of windows
 
 
-def test_the_state_of_a_window_is_that_of_the_motion():
-    """Of a sine, and within the covariance that is stated."""
+def test_the_initial_state_of_a_window_is_that_of_the_motion():
+    """The error for a sine is within its covariance."""
     time, rng = np.arange(0.0, 20.0, 0.005), np.random.default_rng(0)
     at, noise = np.linspace(0.5, 19.5, 400), 1e-3
     values = np.sin(3.0 * time) + rng.normal(0.0, noise, len(time))
@@ -76,7 +78,7 @@ def test_the_state_of_a_window_is_that_of_the_motion():
     assert np.std((state - truth)[:, 0]) < noise and np.std((state - truth)[:, 1]) < 0.05
 
 
-def test_a_state_that_was_not_measured_is_none():
+def test_an_initial_state_that_was_not_measured_is_none():
     time = np.arange(0.0, 2.0, 0.01)
     mask = np.ones((1, len(time), 1), bool)
     mask[0, 50:90] = False
@@ -86,7 +88,7 @@ def test_a_state_that_was_not_measured_is_none():
     np.testing.assert_allclose(state[0], [0.3, 0.0], atol=1e-12)
 
 
-def test_motions_are_replayed_whole_where_a_servo_holds_every_joint():
+def test_motions_are_replayed_whole_if_a_servo_holds_every_joint():
     free = load_scene(Path(__file__).resolve().parents[2] / "experiments" / "xl330.xml")
     assert fully_servoed(scene()) and fully_servoed(free)
     model = copy.copy(free.model)
@@ -115,7 +117,7 @@ def test_windows_of_a_long_log_lie_one_in_each_stretch_and_at_different_phases()
 
 
 def test_windows_that_are_left_out_are_not_compared(space: Space):
-    """Those that stay are the same at a finer time step, and leave as little at the truth."""
+    """The others are the same at a finer time step, with residuals as small at the truth."""
     config, windows = CompareConfig(channels={"position": 1.0}), replace(SHORT, every=0.8)
     log = windowed_log(scene(), space, [swung("a", 1.0, 0.7, noise=NOISE)], config, windows)
     assert log.unit.max() + 1 == 2 and log.unit_seconds == SHORT.length
@@ -127,7 +129,7 @@ def test_windows_that_are_left_out_are_not_compared(space: Space):
 
 
 def test_short_logs_have_windows_at_different_places_and_some_are_test_data(space: Space):
-    """Each gave one window, at its very beginning, and all of them trained; one that is too short ended all."""
+    """Each log gave one window at its beginning, all for training, and a log that was too short raised an error."""
     config, windows = CompareConfig(channels={"position": 1.0}), replace(SHORT, length=1.0, every=1.0)
     logs = [replace(swung("a", 1.0, 0.7), name=name) for name in "abc"]
     stub = replace(logs[0].window(0.0, 1.0), name="stub")
@@ -141,7 +143,7 @@ def test_short_logs_have_windows_at_different_places_and_some_are_test_data(spac
 
 
 class Caught(Exception):
-    """How a log was to be made."""
+    """Arguments with which a log was to be made."""
 
 
 @pytest.mark.parametrize(
@@ -156,7 +158,7 @@ class Caught(Exception):
 def test_long_motions_of_held_joints_are_sampled(
     space: Space, monkeypatch: pytest.MonkeyPatch, replay: Any, longest: float, how: tuple[bool, float | None]
 ):
-    """Of two logs of almost two seconds each; only where nothing else was asked for."""
+    """Two logs of almost two seconds each, unless `replay` is set."""
 
     def catch(*given: Any, whole: bool) -> None:
         raise Caught(whole, given[4].every)
@@ -170,8 +172,8 @@ def test_long_motions_of_held_joints_are_sampled(
     assert caught.value.args == (how[0], pytest.approx(how[1], rel=0.01) if how[1] else None)
 
 
-def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monkeypatch: pytest.MonkeyPatch):
-    """Inside of the bounds; without it at the best of some draws."""
+def test_the_fit_of_a_log_begins_at_given_values(space: Space, monkeypatch: pytest.MonkeyPatch):
+    """They are clipped to the bounds.  Without them it begins at the best of some draws."""
     begun = list[np.ndarray]()
 
     def caught(log: WindowedLog, base: Space, effects: Any, end: float, config: Any, first: Any, *more: Any) -> None:
@@ -191,15 +193,15 @@ def test_the_fit_of_a_log_begins_at_what_an_earlier_one_found(space: Space, monk
     np.testing.assert_allclose(begun, expected)
 
 
-def test_windows_of_mj_steps_own_steps_are_refused(space: Space):
-    """They were replayed by steps of second order, whatever was asked for."""
+def test_mj_step_is_refused_for_windows(space: Space):
+    """The replay has steps of second order and would ignore the setting."""
     config = CompareConfig(channels={"position": 1.0}, mj_step=True)
     with pytest.raises(ValueError, match=r"mj_step is for repeats .* leave mj_step out"):
         windowed_log(scene(), space, [swung("a", 1.0, 0.7)], config, SHORT)
 
 
-def test_columns_in_another_order_are_the_same_joints():
-    """Logs of one robot were refused where a program wrote its joints in another order."""
+def test_logs_may_have_their_joints_in_different_order():
+    """Logs of one robot were refused if a program wrote its joints in another order."""
     space = Space((joint_damping(arm(), "elbow", std=0.1, high=50.0),))
     first = recording(channels={"position": measured(0.0)["position"]}).repeats_subset([0])
     position, config = first.channels["position"], CompareConfig(channels={"position": 1.0})
@@ -214,7 +216,7 @@ def test_columns_in_another_order_are_the_same_joints():
         windowed_log(arm(), space, [first, one], config, SHORT, whole=True)
 
 
-# ----- what windows leave
+# ----- residuals of windows
 
 
 def log_of(space: Space, recordings: list[Recording], **changes: Any) -> WindowedLog:
@@ -227,8 +229,8 @@ def whole_log(space: Space, recordings: list[Recording], **changes: Any) -> Wind
     return windowed_log(scene(), space, recordings, config, windows, whole=True, **changes)
 
 
-def test_windows_leave_noise_at_the_truth(space: Space):
-    """Whatever the gain of a recording; what the spread of their first states does is in the noise."""
+def test_the_residual_of_windows_is_noise_at_the_truth(space: Space):
+    """For recordings of different gains; the noise includes the spread of the initial states."""
     log = log_of(space, [swung("a", 1.0, 0.7, noise=NOISE), swung("soft", 0.6, 1.1, noise=NOISE)], fitted_share=0.7)
     truth = space.values(TRUE)
     assert log.unit.max() + 1 == 8 and log.fitted == 6 and log.whole == ""
@@ -246,13 +248,25 @@ def test_windows_leave_noise_at_the_truth(space: Space):
     assert np.abs(rollout.position[0] - log.measured).max() < 0.02 and rollout.position.shape == (1, 64, 1)
 
 
-def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
+def test_a_log_of_windows_is_no_cost(space: Space):
+    """As a `Cost` it had methods that raised obscure errors or returned an empty cost (`against`, `alone`)."""
+    log = log_of(space, [swung("a", 1.0, 0.7)])
+    assert not isinstance(log, Cost) and not hasattr(log, "alone")
+    rows = block_residual_set(log.with_noise(np.ones(1), np.ones(len(log.clock), bool)), log.unit, least=1)
+    assert rows.cost.comparisons == log.comparisons
+    case = Case(rows, rows, None, space, (), DiscrepancyConfig())
+    with pytest.raises(ValueError, match="a case of windows has no repeats to replace"):
+        case.against({"train": swung("a", 1.0, 0.7)})
+
+
+def test_windows_hold_the_servo_path_before_them(space: Space):
     """A goal that may move by 0.7 rad/s lags for longer than delays do: it began at rest on the last goals alone.
 
     The size is that of the score test, at which slow commands must be limited.
     """
     effects = library(scene(), ["profile_speed"])
-    whole, theta = joined(space, effects), {"profile_speed[swing]": SMALL * effects[0].parameters[0].std}
+    step = SelectionConfig().sensitivity_step * effects[0].parameters[0].std
+    whole, theta = joined(space, effects), {"profile_speed[swing]": step}
     assert effects[0].profile is not None and theta["profile_speed[swing]"] == pytest.approx(1.5)
     log = log_of(whole, [swung("a", 1.0, 0.7)], effects=effects)
     windows, command = log.pieces[0].windows, log.drives[0].command
@@ -266,7 +280,7 @@ def test_windows_know_the_path_that_a_servo_has_drawn_so_far(space: Space):
 
 @pytest.mark.slow
 def test_a_motion_that_is_replayed_whole_has_stretches(space: Space):
-    """Which make blocks, as windows do."""
+    """The stretches make blocks, as windows do."""
     log = whole_log(space, [swung("a", 1.0, 0.7, noise=NOISE)], fitted_share=0.5)
     assert log.whole and log.unit.max() + 1 == 3 and log.fitted == 2 and log.unit_seconds == 0.5
     left = log.residual(space.values(TRUE))
@@ -285,14 +299,14 @@ def of_two_lengths() -> list[Recording]:
 
 
 def test_motions_of_about_one_length_are_replayed_together(space: Space):
-    """In one batch; one that is much shorter is no part of it."""
+    """A much shorter motion is not in their batch."""
     assert shared_steps([400, 100, 380, 390]) == [400, 100, 400, 400] and shared_steps([7]) == [7]
     both = whole_log(space, of_two_lengths())
     assert both.pieces[0].program is both.pieces[1].program
 
 
 def test_a_drift_is_centred_on_the_motion_itself(space: Space):
-    """Not on the longer one of which it shares a program, or it would be an offset besides."""
+    """It is not centred on the longer motion with the same program, where it would add an offset."""
     drift = library(scene(), ["torque_drift"])
     log = whole_log(joined(space, drift), of_two_lengths(), effects=drift)
     lasting = [len(drive.command) for drive in log.drives]
@@ -300,7 +314,7 @@ def test_a_drift_is_centred_on_the_motion_itself(space: Space):
 
 
 @pytest.mark.slow
-def test_a_motion_that_is_replayed_with_another_is_as_it_is_alone(space: Space):
+def test_a_motion_is_the_same_alone_and_in_a_batch_with_another(space: Space):
     logs = of_two_lengths()
     rows, both = np.stack([space.mean, space.values(TRUE)]), whole_log(space, logs)
     alone = [whole_log(space, [log]).simulated(rows) for log in logs]
@@ -322,7 +336,7 @@ def test_a_masked_stretch_leaves_its_windows_out(space: Space):
 
 
 def half_measured() -> Recording:
-    """Of two repeats, the second of which measured next to nothing."""
+    """Two repeats, the second of which has hardly a measured sample."""
     both = swung("a", 1.0, 0.7, noise=NOISE, repeats=2)
     channel = both.channel("position")
     mask = channel.mask.copy()
@@ -336,7 +350,7 @@ def test_a_repeat_that_was_not_measured_is_left_out(space: Space):
 
 
 def test_a_finer_time_step_is_compared_at_the_same_instants(space: Space):
-    """Of motions that end between two steps, some of them just behind an instant that a finer step still reaches."""
+    """The motions end between two steps, some just after an instant that a finer step still reaches."""
     first = swung("a", 1.0, 0.7, noise=NOISE)
     for end in np.linspace(1.501, 1.603, 35):
         commanded = first.time < end - 1e-6
@@ -347,8 +361,8 @@ def test_a_finer_time_step_is_compared_at_the_same_instants(space: Space):
         np.testing.assert_allclose(finer.pieces[0].at, log.pieces[0].at)
 
 
-def test_what_goes_by_the_time_since_the_beginning_is_not_looked_for_in_windows(space: Space):
-    """As a clock's rate does; in whole motions it is."""
+def test_effects_over_time_are_not_tested_in_windows(space: Space):
+    """A clock rate is tested in whole motions alone."""
     effects = library(scene(), ["clock_rate", "joint_coulomb"])
     assert {e.name for e in effects if e.over_time} == {"clock_rate"}
     asked = list[set[str]]()
@@ -366,7 +380,7 @@ def test_what_goes_by_the_time_since_the_beginning_is_not_looked_for_in_windows(
     assert asked == [{"joint_coulomb"}, {"clock_rate", "joint_coulomb"}]
 
 
-def test_the_noise_of_a_window_holds_the_spread_of_its_state():
+def test_the_noise_of_a_window_includes_the_spread_of_its_state():
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(3, 5, 2, 4))  # windows, instants, columns, directions
     deviation, counted = np.array([0.3, 2.0]), np.ones((3, 5, 1), bool)
@@ -378,8 +392,8 @@ def test_the_noise_of_a_window_holds_the_spread_of_its_state():
         np.testing.assert_allclose(matrix @ covariance @ matrix.T, np.eye(10), atol=1e-9)
 
 
-def test_a_motion_that_is_replayed_whole_may_begin_elsewhere(space: Space):
-    """What a wrong start leaves is in the noise, and follows from the instants that count alone."""
+def test_the_start_of_a_whole_motion_is_uncertain(space: Space):
+    """The noise includes the effect of a wrong start, computed from the compared instants alone."""
     truth, right = space.values(TRUE), swung("a", 1.0, 0.7, noise=NOISE)
     off = replace(right, qpos0={joint: start + 20 * NOISE for joint, start in right.measured_start().items()})
     log, noise = whole_log(space, [off]).about(truth), np.full(1, NOISE)
@@ -394,7 +408,7 @@ def test_a_motion_that_is_replayed_whole_may_begin_elsewhere(space: Space):
     np.testing.assert_allclose(other.with_noise(noise, half).whitened(truth[None])[0][half], aware, atol=1e-9)
 
 
-def test_what_acts_on_torque_sensors_alone_is_not_asked_about_in_positions():
+def test_effects_on_torque_sensors_are_not_tested_in_positions():
     recording = swung("a", 1.0, 1.0, ("position", "torque"))
     asked = [{e.name for e in observable_effects(scene(), [recording], channels=c)} for c in (["position"], ["torque"])]
     assert asked[1] - asked[0] == {"torque_bias", "torque_gain", "torque_drift", "sensor_delay"}
@@ -405,14 +419,14 @@ def test_what_acts_on_torque_sensors_alone_is_not_asked_about_in_positions():
 
 
 def plan_of(units: int, fitted: int, length: float, with_test: bool = True) -> Any:
-    """Of a log whose units last a second and hold four instants each."""
+    """Blocks of a log whose units last a second and hold four instants each."""
     log: Any = SimpleNamespace(
         unit=np.repeat(np.arange(units), 4), fitted=fitted, unit_seconds=1.0, comparisons=[SimpleNamespace(name="log")]
     )
-    return planned(log, length, BlocksConfig().shortest, with_test)
+    return planned(log, length, BlocksConfig(), with_test)
 
 
-def test_blocks_are_whole_windows_that_take_turns():
+def test_blocks_of_whole_windows_alternate():
     plan = plan_of(60, 40, 1.9)
     train, validation, test = plan.blocks
     assert not plan.limits and train.max() == validation.max() == 9 and test.max() == 7
@@ -439,7 +453,7 @@ def test_blocks_are_whole_windows_that_take_turns():
         ),
     ],
 )
-def test_a_short_log_gives_up_one_thing_after_the_other(
+def test_a_short_log_has_shorter_blocks_then_no_test_part_then_fewer_blocks(
     units: int, fitted: int, length: float, blocks: list[int], said: list[str]
 ):
     plan = plan_of(units, fitted, length)
@@ -454,7 +468,7 @@ def test_a_short_log_gives_up_one_thing_after_the_other(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("seconds")
-def test_nothing_is_named_in_one_log_of_positions_that_lacks_nothing(space: Space):
+def test_nothing_is_named_in_a_log_of_positions_with_nothing_missing(space: Space):
     effects = library(scene(), ["joint_coulomb", "cable_pull", "command_delay"])
     log = swung("a", 1.0, 0.31, noise=NOISE)
     verdict, _ = dj.find_missing_effects(scene(), space, [log], effects=effects)
@@ -463,8 +477,8 @@ def test_nothing_is_named_in_one_log_of_positions_that_lacks_nothing(space: Spac
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("seconds")
-def test_friction_explains_one_log_of_positions(space: Space):
-    """Of 0.02 N m, which is below the minimum effect size: it explains all, and is not named for its size alone."""
+def test_friction_explains_a_log_of_positions(space: Space):
+    """Friction of 0.02 N m explains the log.  It is not named, since it is below the minimum effect size."""
     effects = library(scene(), ["joint_coulomb", "cable_pull", "command_delay"])
     stuck = swung("rubs", 1.0, 0.31, noise=NOISE, friction=0.02)
     verdict, _ = dj.find_missing_effects(scene(), space, [stuck], effects=effects)

@@ -19,8 +19,8 @@ from benchmarks.rehearse import measured_size, next_step, summary
 from droid_jax.commands.rehearse import plain
 from droid_jax.discrepancy.candidates import ScoreDirection, project
 from droid_jax.discrepancy.config import BlocksConfig, DiscrepancyConfig, SelectionConfig
-from droid_jax.discrepancy.fitting import with_finer_step, with_step_difference
 from droid_jax.discrepancy.statistics import Blocks, Repeats, Resampling, one_sided_p, sign_flips
+from droid_jax.discrepancy.step_error import with_finer_step, with_step_difference
 from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
 from droid_jax.identify.pipeline import IdentifyConfig
 from droid_jax.identify.search import CmaConfig

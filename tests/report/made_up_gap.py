@@ -56,7 +56,7 @@ def gap_json(verdict: str, roles: tuple[str, ...]) -> dict[str, Any]:
     asked = verdict != "fit not converged"
     latch, stribeck = text(LATCH), text(STRIBECK)
     words = {
-        "none": "Nothing is missing that these recordings could tell.",
+        "none": "Nothing is missing that these recordings could show.",
         "named": f"The model lacks: {latch}.",
         "indistinguishable": f"The model lacks one of: {latch} or {stribeck}.",
         "partly explained": f"The model lacks {latch}; a remainder is unexplained.",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from effect_bench import ARM, door, mechanism
 
-from droid_jax.discrepancy.candidates import SMALL
+from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.model.effect_interface import Rollout, State
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
@@ -68,7 +68,7 @@ def test_the_prior_of_compliance_is_relative_to_the_servo():
     (effect,) = library(scene, ["joint_compliance"])
     for parameter, joint in zip(effect.parameters, ARM, strict=True):
         k = scene.model.actuator_gainprm[scene.command_names.index(joint), 0]
-        assert 0.01 < k * SMALL * parameter.std < 0.1
+        assert 0.01 < k * SelectionConfig().sensitivity_step * parameter.std < 0.1
         assert -0.5 <= k * parameter.low < 0.0 and effect.minimum_size <= 0.2 * parameter.std < parameter.high
     assert min(k * effect.minimum_size for k in scene.model.actuator_gainprm[:, 0]) > 0.001
 
