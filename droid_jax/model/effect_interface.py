@@ -123,6 +123,9 @@ class Effect:
     over_time: bool = False
 
 
+LAWS = ("profile", "command", "servo", "force", "frictionloss", "observe", "native")  # fields that are functions
+
+
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:
     """theta with the neutral values of what the effects read and it does not hold.
 

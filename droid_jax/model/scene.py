@@ -59,6 +59,7 @@ class Scene:
         path: of the MJCF that it was loaded from, or None where it was not a file alone.
         held: joints whose dry friction holds still here, and creeps in the MJCF (`load_scene`).
         hold: dry friction that an effect brings to a joint shall hold still too (`effects.registry.ready`).
+        variant: numbers that the model has in place of the MJCF's (`model.variant`), as JSON; empty: none.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Scene:
     path: Path | None = None
     held: tuple[str, ...] = ()
     hold: bool = False
+    variant: str = ""
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named thing; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""
