@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, is_list, mapping, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, is_list, lists_of_numbers, mapping, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
 START = 0.1  # s: a channel that begins no later than this after the command still tells where the motion started
@@ -121,6 +121,8 @@ class Recording:
         known: parameter name -> its value in this recording, in the parameter's unit, where set-ups differ in what is
             known (a payload that was weighed); or the name of the parameter that stands for it here. The replay takes
             it whatever is fitted.
+        variant: field of MjModel -> element -> its number or numbers in this recording, where its MJCF has others than
+            the one that is fitted: another pose of the base, another body's mass (`model.variant`).
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.
         meta: free notes; not part of the content hash.
@@ -135,6 +137,7 @@ class Recording:
     qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
     known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    variant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
     meta: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -341,6 +344,8 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
     }
     if recording.known:  # absent in recordings from before there was such a thing
         head["known"] = known_values(recording)
+    if recording.variant:
+        head["variant"] = lists_of_numbers(recording.variant)
 
     def arrays() -> Iterator[np.ndarray]:
         yield recording.time.astype("<f8")
