@@ -25,6 +25,7 @@ from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia
 from droid_jax.model.parameters import OF_A_JOINT, Role, Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_commands
 from droid_jax.recordings.checks import validate
@@ -133,26 +134,26 @@ class Cost:
             raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
         made, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
-            recording = own_starts(given, (config or old.config).start)
-            new = followed(self.scene, recording, config or old.config)
+            recording, scene = own_starts(given, (config or old.config).start), variant_scene(self.scene, given.variant)
+            new = followed(scene, recording, config or old.config)
             if isinstance(new, Drive):
-                check_gains(self.scene, new)
-            if not _same(self.scene, new, drive):
+                check_gains(scene, new)
+            if not _same(new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
-                    "(side, gravity) or, without commands, has another clock (motion_cutoff changes it too) or other "
-                    "joints whose positions were measured throughout"
+                    "(side, gravity), states another variant of the MJCF or, without commands, has another clock "
+                    "(motion_cutoff changes it too) or other joints whose positions were measured throughout"
                 )
-            drives.append(drive if _start_alike(self.scene, new, drive, (config or old.config).start) else new)
+            drives.append(drive if _start_alike(scene, new, drive, (config or old.config).start) else new)
             replays.append(along_another(replay, drives[-1]))
-            made.append(_compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config))
+            made.append(_compared(scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, made, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
         """Repeats of a recording as if all had started where its replay does (`repeat_starts.from_one_start`)."""
         config = self.comparisons[index].config.start
-        own = own_starts(recording, config)
-        return _from_one_start(self.scene, self.space, own, self.drives[index], self._replays[index], config)
+        own, scene = own_starts(recording, config), variant_scene(self.scene, recording.variant)
+        return _from_one_start(scene, self.space, own, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -198,7 +199,8 @@ def make_cost(
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
     recordings = [own_starts(recording, config.start) for recording in recordings]
-    drives = [followed(scene, r, config) for r in recordings]
+    scenes = [variant_scene(scene, r.variant) for r in recordings]
+    drives = [followed(own, r, config) for own, r in zip(scenes, recordings, strict=True)]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
@@ -208,10 +210,12 @@ def make_cost(
         _warn_of_commanded(space)
     elif engine == "mjx":
         check_friction_rows(scene, space, effects)
-    replays = tuple(compiled_replay(engine, scene, space, d, effects, config.mj_step) for d in drives)
+    replays = tuple(
+        compiled_replay(engine, own, space, d, effects, config.mj_step) for own, d in zip(scenes, drives, strict=True)
+    )
     comparisons = tuple(
-        _compared(scene, space, recording, drive, replay, config)
-        for recording, drive, replay in zip(recordings, drives, replays, strict=True)
+        _compared(own, space, recording, drive, replay, config)
+        for own, recording, drive, replay in zip(scenes, recordings, drives, replays, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
 
@@ -365,9 +369,9 @@ def _apart(along: Along, scene: Scene, recording: Recording, config: CompareConf
     return torques - torques.mean(axis=0)
 
 
-def _same(scene: Scene, new: Drive | Motion, old: Drive | Motion) -> bool:
+def _same(new: Drive | Motion, old: Drive | Motion) -> bool:
     """Whether what was compiled for the one serves the other, from its own start."""
-    if new.torque != old.torque:
+    if new.torque != old.torque or new.variant != old.variant:
         return False
     if isinstance(new, Motion) and isinstance(old, Motion):
         return new.joints == old.joints and np.array_equal(new.time, old.time)

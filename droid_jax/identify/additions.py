@@ -19,6 +19,7 @@ from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.preflight import torque_range
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
@@ -107,6 +108,7 @@ def additions(scene: Scene, recording: Recording) -> tuple[Addition, ...]:
     """The motions that a recording's joints could make besides, inside their ranges; none of a hand on an object."""
     if scene.object_joint is not None or scene.grip is not None:
         return ()
+    scene = variant_scene(scene, recording.variant)
     joints, start = _start(scene, recording)
     step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / RATE
     time = np.arange(round(SECONDS / step) + 1) * step
@@ -270,6 +272,7 @@ def motion_recording(scene: Scene, recording: Recording, addition: Addition, nam
         qpos0=qpos0,
         gains=recording.gains,
         known=recording.known,
+        variant=recording.variant,
     )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.clocks import check_clocks, check_stamps
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.late_commands import check_delay, check_saturation
@@ -34,12 +35,13 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
 
     Args:
         scene: with its nominal values: masses right to a factor of three, servo gains as on the robot. Gains that the
-            recording states count in their place, as in its replay.
+            recording states count in their place, as in its replay, and so do the numbers of its variant.
         recording: a valid one (`recordings.checks.validate`).
 
     Returns:
         The findings; none where all is as it should be, or where too little was measured to tell.
     """
+    scene = variant_scene(scene, recording.variant)
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
         found = [*check_alone(recording, clocks=False), *check_clocks(scene, recording)]

@@ -19,12 +19,14 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.model.effect_interface import Effect, Rollout, complete
+from droid_jax.model.effects.registry import in_variant
 from droid_jax.model.inertia import free_inertias, inertia_possible
 from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
 from droid_jax.model.parameters import Role, Space, Write
 from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import refuse_fluid
+from droid_jax.model.variant import check_writes
 from droid_jax.recordings.recording import TorqueConvention
 from droid_jax.simulate.batching import over_block
 from droid_jax.simulate.c_reference import c_path_torques, c_replay, why_no_path_in_c
@@ -125,10 +127,11 @@ def compiled_replay(
 
     Raises:
         ValueError: a measured motion with mj_step, what plain C does not have, gains that the scene does not have, a
-            model that was changed since MJX had it, or a known value of a parameter that the space does not have or
-            bounds.
+            model that was changed since MJX had it, a known value of a parameter that the space does not have or
+            bounds, or parameters that set what the recording of a variant states.
     """
     scene.check_unchanged()
+    check_writes(scene, space)
     space.with_known(follows.known, space.mean)  # refused here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
@@ -174,6 +177,7 @@ def window_program(
     Of the drive only its time step and its torque's convention are used.
     """
     scene.check_unchanged()
+    check_writes(scene, space)
     check_gains(scene, drive)
     made_with = with_sensors(scene, space, drive, effects)
     clocked = Clocked(drive.timestep, drive.torque, drive)
@@ -216,7 +220,7 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
     Offsets always, all else where the space asks for it.  Friction comes first: it is part of the torque that sensors
     delay, scale or mix.
     """
-    given = {e.name for e in effects}
+    given, effects = {e.name for e in effects}, in_variant(scene, tuple(effects))
     friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
     felt, read = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
     return (*(e for e in felt if e.name not in given), *effects, *(e for e in read if e.name not in given))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy
 
+from droid_jax.arguments import lists_of_numbers
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
@@ -33,6 +35,7 @@ class Motion:
     torque_slack: [J] N m (N), acceleration_slack: [J] rad/s^2 (m/s^2): by how much a torque at rest may leave the
     interval of its friction, because measured torque and acceleration are noisy; None: not at all.
     known: parameter -> its value in this recording, or what stands for it, whatever a row says (`Recording.known`).
+    variant: numbers of the scene that it was made for (`Recording.variant`).
     """
 
     joints: tuple[str, ...]
@@ -47,6 +50,7 @@ class Motion:
     torque_slack: np.ndarray | None = None
     acceleration_slack: np.ndarray | None = None
     known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    variant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
 
     @property
     def timestep(self) -> float:
@@ -123,6 +127,7 @@ def measured_motion(
         torque_slack=config.tolerance * noise,
         acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
         known=dict(recording.known),
+        variant=lists_of_numbers(recording.variant),
     )
 
 
