@@ -139,6 +139,16 @@ def number(
     return out
 
 
+def lists_of_numbers(of: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, list[float]]]:
+    """Numbers by two names as plain data: each a list, of one or more."""
+    import numpy as np
+
+    return {
+        key: {inner: np.ravel(value).astype(np.float64).tolist() for inner, value in each.items()}
+        for key, each in of.items()
+    }
+
+
 def numeric(value: Any, what: str) -> np.ndarray:
     """Numbers as a float64 array, possibly NaN or infinite; texts and lists of unequal length are refused."""
     import numpy as np

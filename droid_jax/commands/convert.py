@@ -74,6 +74,13 @@ class Convert:
     known: tuple[str, ...] = ()
     """Parameters with a known value in this recording, PARAMETER=VALUE in the parameter's unit, e.g. payload=0.5; or
     the parameter that replaces it in this recording, e.g. payload=tool."""
+    variant: Path | None = None
+    """MJCF of this recording alone: that of --scene with other numbers (another mounting, a payload). The recording
+    keeps the numbers that differ, and its replays have them."""
+    scene: Path | None = None
+    """MJCF that fits will be made with, for --variant."""
+    base_pose: tuple[str, float, float, float, float, float, float, float] | None = None
+    """A body of the MJCF and its pose in its parent in this recording alone: x y z in m, and the quaternion w x y z."""
     command_joints: tuple[str, ...] = ()
     """Bags: commanded joints, in the order of commands that carry no names, also as NAME=NAME_IN_THE_MESSAGES; default:
     --joints."""
@@ -142,6 +149,7 @@ def run(command: Convert) -> None:
         recording = recording.window(first if start is None else start, last if end is None else end)
     if command.known:
         recording = replace(recording, known={**recording.known, **_known(command.known)})
+    recording = replace(recording, variant=_variant(command, recording))
     path = save_recording(recording, command.out)
     channels = ", ".join(f"{n} ({len(c.columns)} x {len(c.time)})" for n, c in recording.channels.items())
     repeats = "1 repeat" if recording.repeats == 1 else f"{recording.repeats} repeats"
@@ -226,6 +234,25 @@ def _known(words: tuple[str, ...]) -> dict[str, float | str]:
         except ValueError:
             out[parameter] = value
     return out
+
+
+def _variant(command: Convert, recording: Recording) -> dict[str, dict[str, Any]]:
+    """What the recording states already, or --variant, and --base-pose: numbers by field and element."""
+    numbers = {field: dict(of) for field, of in recording.variant.items()}
+    if (command.variant is None) != (command.scene is None):
+        raise ValueError("--variant and --scene go together: the MJCF of this recording, and that of the fit")
+    if command.variant is not None and command.scene is not None:
+        from droid_jax.model.scene import load_scene
+        from droid_jax.model.variant import numbers_that_differ, variant_text
+
+        scene, variant = (load_scene(path, engine="mujoco") for path in (command.scene, command.variant))
+        numbers = numbers_that_differ(scene, variant)
+        print(f"{command.variant} has other numbers than {command.scene}: {variant_text(numbers) or 'none'}")
+    if command.base_pose is not None:
+        body, *pose = command.base_pose
+        for field, value in (("body_pos", pose[:3]), ("body_quat", pose[3:])):
+            numbers.setdefault(field, {})[body] = value
+    return numbers
 
 
 def _needs_effect(command: Convert, what: str, known: tuple[str, ...]) -> None:

@@ -30,6 +30,7 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     import numpy as np
 
     from droid_jax.model.physics import make_c_model
+    from droid_jax.model.variant import variant_scene
     from droid_jax.simulate.c_engine import poses
     from droid_jax.simulate.replay import make_drive
     from droid_jax.simulate.servo_gains import scale_gains, servo_factors
@@ -38,10 +39,11 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     _forget(out)
     if not recording.command.size:
         return
-    drive = make_drive(found.scene, recording, weigh=False)
-    every, factors = max(1, round(1.0 / (RATE * drive.timestep))), servo_factors(found.scene, drive)
+    scene = variant_scene(found.scene, recording.variant)
+    drive = make_drive(scene, recording, weigh=False)
+    every, factors = max(1, round(1.0 / (RATE * drive.timestep))), servo_factors(scene, drive)
     models = (
-        scale_gains(make_c_model(found.scene, found.full, found.full.with_known(drive.known, v)), factors)
+        scale_gains(make_c_model(scene, found.full, found.full.with_known(drive.known, v)), factors)
         for v in (found.start, found.best)
     )
     before, after = (poses(model, drive.qpos0, drive.command)[::every] for model in models)

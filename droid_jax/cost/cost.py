@@ -25,6 +25,7 @@ from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia
 from droid_jax.model.parameters import OF_A_JOINT, Role, Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.check_log import warn_of_log
 from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_commands
 from droid_jax.recordings.checks import validate
@@ -143,28 +144,26 @@ class Cost:
             raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
         comparisons, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
-            recording = own_starts(given, (config or old.config).start)
-            new = followed(self.scene, recording, config or old.config)
+            recording, scene = own_starts(given, (config or old.config).start), variant_scene(self.scene, given.variant)
+            new = followed(scene, recording, config or old.config)
             if isinstance(new, Drive):
-                check_gains(self.scene, new)
+                check_gains(scene, new)
             if not _same_program(new, drive):
                 raise ValueError(
                     f"recording {recording.name!r} holds other commands than {old.name!r} had, measured another torque "
-                    "(side, gravity) or, without commands, has another clock (motion_cutoff changes it too) or other "
-                    "joints whose positions were measured throughout"
+                    "(side, gravity), states another variant of the MJCF or, without commands, has another clock "
+                    "(motion_cutoff changes it too) or other joints whose positions were measured throughout"
                 )
-            drives.append(drive if _same_start(self.scene, new, drive, (config or old.config).start) else new)
+            drives.append(drive if _same_start(scene, new, drive, (config or old.config).start) else new)
             replays.append(along_another(replay, drives[-1]))
-            comparisons.append(
-                _compared(self.scene, self.space, recording, drives[-1], replays[-1], config or old.config)
-            )
+            comparisons.append(_compared(scene, self.space, recording, drives[-1], replays[-1], config or old.config))
         return assemble(self.scene, self.space, comparisons, replays, drives)
 
     def from_one_start(self, index: int, recording: Recording) -> Recording:
         """Return a recording whose repeats all start where replay `index` does (`repeat_starts.from_one_start`)."""
         config = self.comparisons[index].config.start
-        recording = own_starts(recording, config)
-        return _from_one_start(self.scene, self.space, recording, self.drives[index], self._replays[index], config)
+        recording, scene = own_starts(recording, config), variant_scene(self.scene, recording.variant)
+        return _from_one_start(scene, self.space, recording, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
         def block(rows: np.ndarray) -> Any:
@@ -210,7 +209,8 @@ def make_cost(
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
     recordings = [own_starts(recording, config.start) for recording in recordings]
-    drives = [followed(scene, r, config) for r in recordings]
+    scenes = [variant_scene(scene, r.variant) for r in recordings]
+    drives = [followed(own, r, config) for own, r in zip(scenes, recordings, strict=True)]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
@@ -220,10 +220,12 @@ def make_cost(
         _warn_of_commanded(space)
     elif engine == "mjx":
         check_friction_rows(scene, space, effects)
-    replays = tuple(compiled_replay(engine, scene, space, d, effects, config.mj_step) for d in drives)
+    replays = tuple(
+        compiled_replay(engine, own, space, d, effects, config.mj_step) for own, d in zip(scenes, drives, strict=True)
+    )
     comparisons = tuple(
-        _compared(scene, space, recording, drive, replay, config)
-        for recording, drive, replay in zip(recordings, drives, replays, strict=True)
+        _compared(own, space, recording, drive, replay, config)
+        for own, recording, drive, replay in zip(scenes, recordings, drives, replays, strict=True)
     )
     return assemble(scene, space, comparisons, replays, drives)
 
@@ -381,7 +383,7 @@ def _motion_torques(along: Along, scene: Scene, recording: Recording, config: Co
 
 def _same_program(new: Drive | Motion, old: Drive | Motion) -> bool:
     """Whether a replay compiled for `old` can replay `new`, which may start elsewhere."""
-    if new.torque != old.torque:
+    if new.torque != old.torque or new.variant != old.variant:
         return False
     if isinstance(new, Motion) and isinstance(old, Motion):
         return new.joints == old.joints and np.array_equal(new.time, old.time)

@@ -25,6 +25,7 @@ from droid_jax.model.fields import check_space
 from droid_jax.model.inertia import check_inertia
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Phase, Recording
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.windows import TooShort, WindowConfig, why_no_windows
@@ -282,18 +283,19 @@ def windowed_log(
     check_read(scene, space, effects)
     check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
+    scenes = [variant_scene(scene, recording.variant) for recording in recordings]
     reasons = [why_no_windows(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")
     drives = list[Drive]()
-    for recording in recordings:
-        drive = followed(scene, recording, config)
+    for own, recording in zip(scenes, recordings, strict=True):
+        drive = followed(own, recording, config)
         assert isinstance(drive, Drive)
         drives.append(drive)
     replay_steps = shared_steps([len(drive.command) for drive in drives], effects)
     candidates, short = list[Piece | None](), dict[str, TooShort]()
-    for recording, drive, steps in zip(recordings, drives, replay_steps, strict=True):
+    for own, recording, drive, steps in zip(scenes, recordings, drives, replay_steps, strict=True):
         for repeat in range(recording.repeats):
-            of = scene, space, recording, repeat, drive, config, windows, effects
+            of = own, space, recording, repeat, drive, config, windows, effects
             number = sum(piece.count for piece in candidates if piece is not None)
             try:
                 candidates.append(as_full_motion(*of, steps, grid) if why else in_windows(*of, grid, number))

@@ -26,6 +26,7 @@ from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.preflight import torque_range
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
@@ -110,6 +111,7 @@ def additions(scene: Scene, recording: Recording, config: ProposalConfig = DEFAU
     """
     if scene.object_joint is not None or scene.grip is not None:
         return ()
+    scene = variant_scene(scene, recording.variant)
     joints, start = _start(scene, recording)
     step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / config.rate
     time = np.arange(round(config.seconds / step) + 1) * step
@@ -277,6 +279,7 @@ def motion_recording(scene: Scene, recording: Recording, addition: Addition, nam
         qpos0=qpos0,
         gains=recording.gains,
         known=recording.known,
+        variant=recording.variant,
     )
 
 

@@ -31,6 +31,7 @@ from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.fields import check_space
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Channel, Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
@@ -100,12 +101,12 @@ def evaluate_on(
     if engine == "auto":
         engine = choose_engine(scene, space, recordings, effects).engine
     for given in recordings:
-        recording = own_starts(given, config.start)
+        recording, own = own_starts(given, config.start), variant_scene(scene, given.variant)
         informative_channels(scene, [recording])
-        compared = _with_comparable_torques(scene, recording, config)
+        compared = _with_comparable_torques(own, recording, config)
         channels = dict.fromkeys(measured_channels(scene, compared), 1.0)
-        follows = followed(scene, recording, replace(config, channels=channels))
-        replay = compiled_replay(engine, scene, space, follows, effects, config.mj_step)
+        follows = followed(own, recording, replace(config, channels=channels))
+        replay = compiled_replay(engine, own, space, follows, effects, config.mj_step)
         rollouts, clock = in_blocks(replay, rows), replay_clock(recording, follows)
         pair = sample_of(rollouts, 0), sample_of(rollouts, 1)
         out.append(Replayed(recording, clock, *pair, channel_errors(scene, compared, clock, *pair)))

@@ -36,6 +36,7 @@ from droid_jax.identify.multistart import Refined
 from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_no_path_in_c, why_not_in_c
 
@@ -222,7 +223,8 @@ def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> s
     """Return "mujoco" if plain C can replay the recordings, since it needs no compilation; else "mjx"."""
     contacts = scene.grip is not None or scene.model.npair
     for recording in recordings:
-        if recording.command.size and (contacts or why_not_in_c(scene, space, recording.torque, ())):
+        own = variant_scene(scene, recording.variant)
+        if recording.command.size and (contacts or why_not_in_c(own, space, recording.torque, ())):
             return "mjx"
         if not recording.command.size and why_no_path_in_c(space, recording.torque, ()):
             return "mjx"

@@ -23,6 +23,7 @@ from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, with_options
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import c_replay
@@ -177,8 +178,9 @@ def creep_of_fit(scene: Scene, space: Space, best: np.ndarray, recordings: Seque
     """Return notes about joints that creep with the fitted values `best` [D] but not with the scene's values."""
     notes = list[str]()
     for recording in recordings:
-        fitted = make_c_model(scene, space, space.with_known(recording.known, best))
-        if not creep_note(scene, recording) and (text := creep_note(scene, recording, fitted)):
+        own = variant_scene(scene, recording.variant)
+        fitted = make_c_model(own, space, space.with_known(recording.known, best))
+        if not creep_note(own, recording) and (text := creep_note(own, recording, fitted)):
             notes.append(text)
     return notes
 
@@ -253,7 +255,8 @@ class _Replayed:
 
     def _finer(self, times: int) -> tuple[Scene, Drive]:
         """The scene with a finer time step, and the same commands on it."""
-        scene = with_options(self.cost.scene, timestep=self.drive.timestep / times)
+        finer = with_options(self.cost.scene, timestep=self.drive.timestep / times)
+        scene = variant_scene(finer, self.recording.variant)
         return scene, replace(make_drive(scene, self.recording, weigh=False), qpos0=self.drive.qpos0)
 
     def _in_mjx(self, times: int, mj_step: bool = False) -> Rollout | str:

@@ -127,6 +127,9 @@ class Effect:
     over_time: bool = False
 
 
+LAWS = ("profile", "command", "servo", "force", "frictionloss", "observe", "native")  # fields that are functions
+
+
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:
     """theta, with neutral values for parameters of the effects that it lacks.
 

@@ -254,16 +254,25 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
     for body in bodies:
         for field, number in inertial_fields(scene.model, body, terms[body]).items():
             getattr(model, field)[body] = number
-    for _, write in model_writes(space):
-        if write.field in ("body_ipos", "body_iquat"):
-            bodies.add(write.index[0])
-        elif write.field in ("jnt_pos", "jnt_axis"):
-            bodies.add(int(model.jnt_bodyid[write.index[0]]))
+    settle(model, entries_written(space))
+    return model
+
+
+def settle(model: mujoco.MjModel, entries: Sequence[tuple[str, tuple[int, ...]]], *, derive: bool = False) -> None:
+    """Make a model of the C engine what the compiler makes of it, after some of its numbers were written.
+
+    entries: (field, index) that were.  derive: work the constants out again, whichever these were.
+    """
+    bodies, written = set[int](), {field for field, _ in entries}
+    for field, index in entries:
+        if field in ("body_ipos", "body_iquat"):
+            bodies.add(index[0])
+        elif field in ("jnt_pos", "jnt_axis"):
+            bodies.add(int(model.jnt_bodyid[index[0]]))
     no_short_cut(model, sorted(bodies))
-    written = {field for field, _ in entries_written(space)}
     for array in (getattr(model, field) for field in written.intersection(UNIT)):
         array /= np.linalg.norm(array, axis=1, keepdims=True)
-    if (_SOURCES | _PLACES) & written:
+    if derive or (_SOURCES | _PLACES) & written:
         data = mujoco.MjData(model)
         mujoco.mj_setConst(model, data)
         # mj_setConst does not update the statistics, with which the solver scales its tolerance.
@@ -271,8 +280,7 @@ def make_c_model(scene: Scene, space: Space, values: np.ndarray) -> mujoco.MjMod
         model.stat.meanmass = model.body_subtreemass[0] / (model.nbody - 1)
     if (_PLACES | {"geom_size"}) & written:  # bounding boxes of several geoms are not updated
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-        _bound(model, {w.index[0] for _, w in model_writes(space) if w.field == "geom_size"})
-    return model
+        _bound(model, {index[0] for field, index in entries if field == "geom_size"})
 
 
 def no_short_cut(model: mujoco.MjModel, bodies: Sequence[int]) -> None:

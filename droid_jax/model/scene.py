@@ -59,6 +59,7 @@ class Scene:
         path: of the MJCF; None if the scene is not from one file.
         held: joints whose friction constraint is hard here and soft in the MJCF (`load_scene`).
         hold: whether friction constraints that effects add are hard too (`effects.registry.ready`).
+        variant: numbers that the model has in place of the MJCF's (`model.variant`), as JSON; empty: none.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Scene:
     path: Path | None = None
     held: tuple[str, ...] = ()
     hold: bool = False
+    variant: str = ""
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named element; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""

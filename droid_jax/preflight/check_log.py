@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.clocks import check_clocks, check_stamps
 from droid_jax.preflight.findings import Finding
 from droid_jax.preflight.late_commands import check_delay, check_saturation
@@ -34,12 +35,13 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
 
     Args:
         scene: at its nominal values: masses within a factor of three, servo gains as on the robot. Gains that the
-            recording states replace the scene's, as in its replay.
+            recording states replace the scene's, as in its replay, and so do the numbers of its variant.
         recording: a valid one (`recordings.checks.validate`).
 
     Returns:
         The findings; empty if nothing is wrong, or if the measurements are too few for a check.
     """
+    scene = variant_scene(scene, recording.variant)
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
         found = [*check_alone(recording, clocks=False), *check_clocks(scene, recording)]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.check_log import check_alone, check_log
 from droid_jax.preflight.clocks import GAP_STEPS
 from droid_jax.preflight.findings import Finding, Kind
@@ -34,6 +35,10 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
     """
     if scene is None:
         return _sorted(check_alone(recording))
+    try:
+        scene = variant_scene(scene, recording.variant)
+    except ValueError as error:
+        return _sorted([*check_alone(recording), Finding("scene", "", 0.0, 0.0, "certain", str(error))])
     found: list[Finding] = []
     found += _said("range", lambda: check_range(scene, recording))
     found += check_log(scene, recording)

@@ -10,6 +10,7 @@ import numpy as np
 
 from droid_jax.model.actuators import drives_joint, has_feedback
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene, variant_text
 from droid_jax.preflight.creep import creep_note
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.closed_loops import OPEN, open_loops
@@ -27,20 +28,30 @@ MOST_TURNS = 4  # turns from zero of a hinge without a range; angles in degrees 
 def command_notes(scene: Scene, recording: Recording) -> list[str]:
     """Notes about the commands of a recording in a scene.
 
-    They concern actuators without position feedback, servos with a gear, actuators without commands, gains that differ
-    from the scene's, open loops, commands and torques beyond limits, and joints that creep.
+    They concern actuators without position feedback, servos with a gear, actuators without commands, gains and numbers
+    that differ from the scene's, open loops, commands and torques beyond limits, and joints that creep.
     """
+    scene = variant_scene(scene, recording.variant)
     said = (
         open_loop(scene, recording),
         geared(scene, recording),
         left_alone(scene, recording),
         gains_note(scene, recording),
+        variant_note(recording),
         closed_loop(scene, recording),
         clipped_commands(scene, recording),
         exceeded_torques(scene, recording),
         creep_note(scene, recording),
     )
     return [text for text in said if text]
+
+
+def variant_note(recording: Recording) -> str:
+    """What is to be known of numbers that a recording states in place of the MJCF's; empty where it states none."""
+    if not recording.variant:
+        return ""
+    text = variant_text(recording.variant)
+    return f"the replay of recording {recording.name!r} has numbers of its own (variant): {text}"
 
 
 def warn_of_commands(scene: Scene, recording: Recording) -> None:

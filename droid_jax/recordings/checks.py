@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import instance, instances, name, note, number, shown
+from droid_jax.arguments import instance, instances, is_list, name, note, number, shown
 from droid_jax.errors import faults
 from droid_jax.recordings.clocks import SLACK, check_clock
 from droid_jax.recordings.recording import (
@@ -65,6 +65,7 @@ def validate(recording: Recording, *, source: str = "", allow_jitter: bool = Fal
     for parameter, value in recording.known.items():
         if not isinstance(value, str):
             number(value, f"{where}: known value of {parameter!r}")
+    _check_variant(recording, where)
     _check_phases(recording, where)
     if recording.gains is not None:
         _check_gains(recording.gains, recording.command_names, where)
@@ -102,6 +103,7 @@ def _check_types(recording: Recording, where: str) -> None:
         ("channels", recording.channels, "names to channels"),
         ("qpos0", recording.qpos0, "joint names to positions"),
         ("known", recording.known, "parameter names to values or names"),
+        ("variant", recording.variant, "fields of the model to elements and their numbers"),
         ("meta", recording.meta, "texts to texts"),
     ):
         if not isinstance(mapping, Mapping):
@@ -130,6 +132,18 @@ def _check_texts(recording: Recording, where: str) -> None:
         name(phase.name, f"{where}: a phase's name")
     for key, text in recording.meta.items():
         note(text, f"{where}: meta {name(key, f'{where}: a key of meta')!r}")
+
+
+def _check_variant(recording: Recording, where: str) -> None:
+    for key, of in recording.variant.items():
+        name(key, f"{where}: a field of variant")
+        if not isinstance(of, Mapping):
+            raise ValueError(f"{where}: variant, {key!r} must map elements to their numbers, got {shown(of)}")
+        for element, value in of.items():
+            what = f"{where}: variant, {key} of {shown(element)}"
+            name(element, what)
+            for one in value if is_list(value) else [value]:
+                number(one, what)
 
 
 def check_joints(recording: Recording, joints: Sequence[str], also: Sequence[str] = ()) -> None:

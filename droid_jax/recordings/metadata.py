@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from droid_jax.arguments import shown
+from droid_jax.arguments import lists_of_numbers, shown
 from droid_jax.read_json import parse_json, typed
 from droid_jax.recordings.recording import (
     Channel,
@@ -39,6 +39,7 @@ class Metadata:
     qpos0: dict[str, float]
     gains: ServoGains | None
     known: dict[str, float | str]
+    variant: dict[str, dict[str, float | list[float]]]
     phases: tuple[Phase, ...]
     object_pose: ObjectPose | None
     meta: dict[str, str]
@@ -83,6 +84,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     qpos0: dict[str, float] = {}
     gains: _Gains | None = None
     known: dict[str, float | str] = {}
+    variant: dict[str, dict[str, float | list[float]]] = {}
     phases: list[_Phase] = []
     object_pose: _Pose | None = None
     meta: dict[str, str | float | bool | None] = {}
@@ -108,6 +110,8 @@ def metadata_to_json(recording: Recording) -> str:
             meta["gains"]["damping"] = _floats(gains.damping)
     if recording.known:
         meta["known"] = known_values(recording)
+    if recording.variant:
+        meta["variant"] = lists_of_numbers(recording.variant)
     if pose is not None:
         meta["object_pose"] = {
             "position": _floats(pose.position),
@@ -145,6 +149,7 @@ def metadata_from_json(text: str, where: str) -> Metadata:
         qpos0=file.qpos0,
         gains=None if file.gains is None else _gains(file.gains),
         known=file.known,
+        variant=file.variant,
         phases=tuple(Phase(p.name, p.start, p.end) for p in file.phases),
         object_pose=None if file.object_pose is None else _pose(file.object_pose, where),
         meta={key: str(value) for key, value in file.meta.items()},
@@ -184,6 +189,7 @@ def recording_of(
         qpos0=meta.qpos0,
         gains=meta.gains,
         known=meta.known,
+        variant=meta.variant,
         phases=meta.phases,
         object_pose=meta.object_pose,
         meta=meta.meta,

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, choice, flag, is_list, mapping, number, shown, whole
+from droid_jax.arguments import check_fields, choice, flag, is_list, lists_of_numbers, mapping, number, shown, whole
 from droid_jax.recordings.clocks import SLACK
 
 LATEST_START = 0.1  # s after the first command: the initial position is that of a channel which begins by then
@@ -119,6 +119,8 @@ class Recording:
         gains: servo gains, when known.
         known: parameter name -> known value in this recording, in the parameter's unit (a payload that was weighed);
             or -> name of the parameter to use in its place. The replay uses it whatever is fitted.
+        variant: field of MjModel -> element -> its number or numbers in this recording, where its MJCF has others than
+            the one that is fitted: another pose of the base, another mass of a body (`model.variant`).
         phases: named parts of the motion.
         object_pose: pose of the manipulated object, when known.
         meta: free notes; not part of the content hash.
@@ -133,6 +135,7 @@ class Recording:
     qpos0: Mapping[str, float] = field(default_factory=dict[str, float])
     gains: ServoGains | None = None
     known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    variant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
     phases: tuple[Phase, ...] = ()
     object_pose: ObjectPose | None = None
     meta: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -344,6 +347,8 @@ def _content(recording: Recording) -> tuple[dict[str, Any], Iterator[np.ndarray]
     }
     if recording.known:  # left out when empty, so that hashes of older recordings stay the same
         head["known"] = known_values(recording)
+    if recording.variant:
+        head["variant"] = lists_of_numbers(recording.variant)
 
     def arrays() -> Iterator[np.ndarray]:
         yield recording.time.astype("<f8")

@@ -19,12 +19,14 @@ import numpy as np
 
 from droid_jax import runtime
 from droid_jax.model.effect_interface import Effect, Rollout, complete
+from droid_jax.model.effects.registry import in_variant
 from droid_jax.model.inertia import free_inertias, inertia_possible
 from droid_jax.model.joint_friction import direction, joint_friction_effect, torque_gain_effect
 from droid_jax.model.parameters import Role, Space, Write
 from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import refuse_fluid
+from droid_jax.model.variant import check_writes
 from droid_jax.recordings.recording import TorqueConvention
 from droid_jax.simulate.batching import over_block
 from droid_jax.simulate.c_reference import c_path_torques, c_replay, why_no_path_in_c
@@ -125,10 +127,12 @@ def compiled_replay(
 
     Raises:
         ValueError: a measured motion with mj_step, a replay that plain C does not support, gains for actuators that
-            are no position servos, a model that was changed after MJX got it, or a known value of a parameter that
-            the space does not have or that is out of its bounds.
+            are no position servos, a model that was changed after MJX got it, a known value of a parameter that the
+            space does not have or that is out of its bounds, or parameters that set what the recording of a variant
+            states.
     """
     scene.check_unchanged()
+    check_writes(scene, space)
     space.with_known(follows.known, space.mean)  # raise here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
@@ -183,6 +187,7 @@ def window_program(
         Rollout [B, steps, ...].
     """
     scene.check_unchanged()
+    check_writes(scene, space)
     check_gains(scene, drive)
     made_with = with_sensors(scene, space, drive, effects)
     clocked = Clocked(drive.timestep, drive.torque, drive)
@@ -225,7 +230,7 @@ def with_sensors(scene: Scene, space: Space, drive: Drive | Motion, effects: Seq
     Torque offsets are always added, friction and gain of sensors if the space has their parameters.  Friction comes
     first, since sensors delay, scale or mix a torque that contains it.
     """
-    given = {e.name for e in effects}
+    given, effects = {e.name for e in effects}, in_variant(scene, tuple(effects))
     friction, gain = bool(space.of_role(Role.VISCOUS, Role.COULOMB)), bool(space.of_role(Role.TORQUE_GAIN))
     before, after = _sensor_effects(scene.joints, isinstance(drive, Motion), friction, gain)
     return (*(e for e in before if e.name not in given), *effects, *(e for e in after if e.name not in given))

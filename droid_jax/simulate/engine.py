@@ -20,6 +20,7 @@ from droid_jax import distributed, runtime
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
+from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_not_in_c
 
@@ -63,7 +64,7 @@ def choose_engine(
         return EngineChoice("mjx", "repeats resolve the error of C's first-order steps")
     if scene.grip is not None or scene.model.npair:
         return EngineChoice("mjx", "contact pairs need its second-order step")
-    reasons = [why_not_in_c(scene, space, r.torque, effects) for r in recordings]
+    reasons = [why_not_in_c(variant_scene(scene, r.variant), space, r.torque, effects) for r in recordings]
     if reason := next(filter(None, reasons), None):
         return EngineChoice("mjx", reason)
     case = f"for {samples} samples a batch" if accelerated else "on a CPU"

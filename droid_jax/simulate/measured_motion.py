@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy
 
+from droid_jax.arguments import lists_of_numbers
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention
 from droid_jax.simulate.rest import RestConfig, at_rest, derivative_noise, torque_at, white_noise
 
@@ -38,6 +40,7 @@ class Motion:
         acceleration_slack: [J] rad/s^2 (m/s^2), likewise noise of the acceleration; None: 0.
         known: parameter -> its value in this recording, or the parameter that replaces it; it overrides the fitted
             vector (`Recording.known`).
+        variant: numbers of the scene that it was made for (`Recording.variant`).
     """
 
     joints: tuple[str, ...]
@@ -52,6 +55,7 @@ class Motion:
     torque_slack: np.ndarray | None = None
     acceleration_slack: np.ndarray | None = None
     known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    variant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
 
     @property
     def timestep(self) -> float:
@@ -137,6 +141,7 @@ def measured_motion(
         torque_slack=config.tolerance * noise,
         acceleration_slack=config.tolerance * derivative_noise(white, 2, rate, cutoff),
         known=dict(recording.known),
+        variant=lists_of_numbers(recording.variant),
     )
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from droid_jax.arguments import lists_of_numbers
 from droid_jax.model.actuators import has_servo_damping
 from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
@@ -59,6 +60,7 @@ class Drive:
         sent: [U] bool, actuators that the recording commands, the others hold their start; None: all.
         known: parameter -> its value in this recording, or the parameter that replaces it; it overrides the fitted
             vector (`Recording.known`).
+        variant: numbers of the scene that it was made for (`Recording.variant`).
     """
 
     command: np.ndarray
@@ -69,6 +71,7 @@ class Drive:
     damping: np.ndarray | None = None
     sent: np.ndarray | None = None
     known: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
+    variant: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
 
     @property
     def time(self) -> np.ndarray:
@@ -127,6 +130,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
         damping=damping,
         sent=columns >= 0,
         known=dict(recording.known),
+        variant=lists_of_numbers(recording.variant),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_gap
 from small_gap import EFFECTS, FLOOR, QUICK, Small, problem_of, quiet, record, small, small_scene
 
 from droid_jax.discrepancy import candidate_fits, cross_validation, search
@@ -30,7 +32,7 @@ from droid_jax.discrepancy.fitting import FittedModel, base_fit
 from droid_jax.discrepancy.search import SearchState, open_directions, pair_step, search_effects, selection_step
 from droid_jax.discrepancy.selection import Reason, Rejection, SelectionStep, ValidationTest
 from droid_jax.discrepancy.statistics import OUTSIDE, Blocks, Repeats
-from droid_jax.discrepancy.verdict import Conclusion
+from droid_jax.discrepancy.verdict import Conclusion, Verdict
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.candidate import Candidate, EffectKey, candidates
@@ -39,6 +41,7 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 
 PRELOAD = EffectKey("hinge_preload", "door")
+FRICTION = 0.5  # N m
 
 
 @pytest.fixture(scope="module")
@@ -520,3 +523,28 @@ def test_a_further_fit_that_does_not_converge_does_not_replace_a_converged_model
         begun = model(before)
         found, said = candidate_fits.polished(problem, begun)
         assert found is (after if taken else begun) and said == notes
+
+
+@functools.cache
+def whole_search(preload: float, friction: float) -> Verdict:
+    """What is said of a robot that hides so much."""
+    scene, space = small_scene()
+    recordings = {name: record(name, preload=preload, friction=friction) for name in ("train", "validation")}
+    case = make_case(
+        scene, space, library(scene, (*EFFECTS, "joint_coulomb")), **recordings, config=replace(QUICK, max_effects=2)
+    )
+    return search_effects(case, base_fit(case.train, case.base, case.config, quiet), FLOOR)
+
+
+@pytest.mark.slow
+def test_where_nothing_is_hidden_nothing_is_missing():
+    found = whole_search(0.0, 0.0)
+    assert found.conclusion is Conclusion.NONE and not found.effects
+    assert found.score_tests[0].p > 0.01
+
+
+@pytest.mark.slow
+def test_two_effects_are_both_named_and_nothing_else():
+    found = whole_search(small_gap.PRELOAD, FRICTION)
+    assert found.conclusion is Conclusion.NAMED
+    assert set(found.effects) == {PRELOAD, EffectKey("joint_coulomb", "elbow")}

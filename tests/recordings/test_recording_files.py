@@ -55,6 +55,7 @@ def make(dtype=np.float64) -> Recording:
         qpos0={"j1": 0.1, "j2": 1 / 3},
         gains=ServoGains(np.array([600.0, 250.0]), np.array([50.0, 15.0])),
         known={"payload": 0.25, "rotor": "second rotor"},
+        variant={"body_mass": {"payload": [0.25]}, "body_quat": {"base": [0.8, 0.0, 0.6, 0.0]}},
         phases=(Phase("opening", 0.05, 0.1),),
         object_pose=ObjectPose(np.array([0.5, 0, 0.3]), np.array([1.0, 0, 0, 0]), np.diag([1e-6] * 6)),
         meta={"robot": "panda", "note": "Tür"},

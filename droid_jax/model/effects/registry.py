@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import LAWS, Effect
 from droid_jax.model.effects.effect_scaling import sized
 from droid_jax.model.fields import ENCODER
 from droid_jax.model.inertia import PSEUDO_INERTIA, WEIGHTS
@@ -136,6 +136,24 @@ def ready(scene: Scene) -> Scene:
         spec.joint(joint).solimp_friction[:2] = HARD
         model.dof_solimp[scene.dof(joint), :2] = HARD
     return replace(scene, model=model, spec=spec, held=(*scene.held, *soft))
+
+
+@functools.lru_cache(maxsize=64)
+def in_variant(scene: Scene, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    """The effects with the laws that they have in a scene with the numbers of one recording (`model.variant`).
+
+    A law may hold numbers of the scene that it was made for, such as where a load hangs.  Their parameters stay.
+    Raises ValueError for an effect that such a scene cannot have.
+    """
+    if not scene.variant:
+        return effects
+    found = list[Effect]()
+    for effect in effects:
+        made = _MAKERS[effect.name](scene) if effect.name in _MAKERS else effect
+        if made is None:
+            raise ValueError(f"scene {scene.name!r} cannot have the effect {effect.name!r} with a recording's variant")
+        found.append(replace(effect, **{law: getattr(made, law) for law in LAWS}))
+    return tuple(found)
 
 
 def joined(base: Space, effects: Iterable[Effect]) -> Space:
