@@ -181,7 +181,7 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     sure, others = fits[: config.sure_refits], fits[config.sure_refits :]
     others = sorted(others, key=lambda fit: fit[1])[: max(config.full_refits - len(sure), 0)]
     best = sorted([*sure, *others], key=lambda fit: fit[1])[: config.full_refits]
-    begun = SelectionStep(found, model.keys, tuple(ranked), tuple(p for _, _, p in best))
+    begun = SelectionStep(found, model.keys, tuple(ranked), nearest=tuple(p for _, _, p in best))
     starts = [((*model.parts, *p.parts), values) for values, _, p in best]
     certain = {id(p) for _, _, p in sure}
     reached = [-np.inf if id(p) in certain else objective for _, objective, p in best]

@@ -102,11 +102,11 @@ class SelectionStep:
     score_test: ScoreTest
     before: Keys = ()
     ranked: tuple[Proposal, ...] = ()
-    nearest: tuple[Proposal, ...] = ()
     tried: tuple[FittedModel, ...] = ()
     tests: tuple[ValidationTest, ...] = ()
     selected: FittedModel | None = None
     chosen: ValidationTest | None = None
+    nearest: tuple[Proposal, ...] = ()
 
     @property
     def indistinguishable(self) -> tuple[FittedModel, ...]:

@@ -62,7 +62,7 @@ def test_what_the_synthetic_robot_hid_is_said_in_the_librarys_words_too(tmp_path
     searched = json.loads(path.read_text())
     searched["setup"] |= {"synthetic_robot": True, "hidden": in_words(["magnetic_catch=1.5", "detent=0.5"])}
     path.write_text(json.dumps(searched))
-    assert "robot: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; the library" in lead()
+    assert "robot: magnetic catch (1.5 N m; in the library: latch) and detent (0.5 N m; not in the library)" in lead()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from two_link import ARM, JOINTS, arm, measured, motion, recording
 
-from droid_jax.cost.cost import _start_alike, followed, make_cost
+from droid_jax.cost.cost import _same_start, followed, make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.door.demonstration import demonstration_path
 from droid_jax.door.scene import door_scene
@@ -196,7 +196,7 @@ def test_repeats_of_a_door_that_is_just_ajar_share_a_replay():
 
     shut, ajar, open_ = (seen(angle) for angle in (AJAR - 1e-3, AJAR + 1e-3, 2 * AJAR))
     assert shut.qpos0[door.qpos("hinge")] == 0.0 and ajar.qpos0[door.qpos("hinge")] > AJAR
-    one_motion = partial(_start_alike, door, config=DEFAULT_START)
+    one_motion = partial(_same_start, door, config=DEFAULT_START)
     assert one_motion(shut, ajar) and one_motion(ajar, shut) and not one_motion(shut, open_)
     assert not one_motion(open_, seen(2 * AJAR + 0.015))  # neither is put back: these are two motions
 
@@ -253,9 +253,9 @@ def test_the_scatter_of_coupled_joints_is_allowed():
     heavy = {"torque": replace(recording().torque, gravity=True), "gains": None}
     one, other = (make_drive(scene, recording(qpos0={"shoulder": 0.2, "elbow": q}, **heavy)) for q in (0.4, 0.401))
     assert np.abs(one.qpos0 - other.qpos0).max() == pytest.approx(0.05)
-    assert _start_alike(scene, one, other, DEFAULT_START)
+    assert _same_start(scene, one, other, DEFAULT_START)
     stated = {"shoulder": 0.2, "elbow": 0.401, "mimic": float(other.qpos0[scene.qpos("mimic")]) + 0.2}
-    assert not _start_alike(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)), DEFAULT_START)
+    assert not _same_start(scene, one, make_drive(scene, recording(qpos0=stated, **heavy)), DEFAULT_START)
 
 
 @pytest.mark.parametrize(("speed", "warned"), [(0.0, 0), (0.4, 1)])
