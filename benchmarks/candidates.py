@@ -81,7 +81,7 @@ def main() -> None:
     row = usual["full"] / arguments.rows
     usual_steps = LevenbergMarquardtConfig()
     steps = usual_steps.chords * usual_steps.trials  # of an iteration, where every batch along one Jacobian pays
-    look_rows = 2 * (1 + steps)  # from two starts, whose Jacobian is known
+    look_rows = 2 * (1 + config.one_step.chords * config.one_step.trials)  # from two starts, whose Jacobian is known
     refit_rows = 2 * (len(base) + 2) + steps
     result = {
         "quick": arguments.quick,

@@ -18,7 +18,7 @@ from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
 from droid_jax.model.effects.candidate import Candidate, names_of
 
-ONE_STEP_BATCH = 12  # candidates whose one-step fits share batches: few of them do not fill a block of a CPU
+ONE_STEP_BATCH = 6  # candidates whose one-step fits share batches: few of them do not fill a block of a CPU
 Start = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
 
 
@@ -116,14 +116,15 @@ def staged_refit(
         what: name of the models that are skipped when time runs out, for the notes.
         note: addition to the models' names, for the progress.
         one_step: objective without the effects, and that of each model after one step.  A model whose step is hopeless
-            by the rule that gives up a refit (`RefineConfig.give_up`) is not refitted.  None: all are refitted.
+            by the rule that gives up a refit (`RefineConfig.give_up`) is not refitted, unless it is the first.  None:
+            all are refitted.
     """
     models, failed, config = list[FittedModel](), list[str](), problem.case.config.refit
     for number, (parts, start) in enumerate(starts):
         if number and problem.late:
             return models, Notes(tuple(failed)) + _skipped(len(starts) - number, len(starts), what)
         target = min([target, *(m.refined.objective for m in models)])
-        if one_step is not None:
+        if one_step is not None and models:
             before, reached = one_step[0], one_step[1][number]
             if config.give_up * (before - reached) < reached - target:
                 continue

@@ -241,8 +241,9 @@ def _alternatives_in_basin(problem: Problem, done: SelectionStep, winner: Fitted
     """
     case, config = problem.case, problem.case.config
     basin = at_neutral(problem, winner, winner.coefficients)
-    tried = {m.keys for m in done.tried if m is not winner}
-    others = [p for p in done.ranked if p.keys in tried]
+    # In the other basin some were not refitted, as their one step was hopeless there.
+    best = ({m.keys for m in done.tried} | {p.keys for p in done.nearest}) - {winner.keys}
+    others = [p for p in done.ranked if p.keys in best]
     near = [*others, *_collinear_candidates(done, config.selection.collinear)]
     starts = [(p.parts, p.start(case.full_space, basin)) for p in near]
     note, what = " (from the best model's values)", "alternatives not refitted from the best model's values"
@@ -251,8 +252,8 @@ def _alternatives_in_basin(problem: Problem, done: SelectionStep, winner: Fitted
         before = min(problem.base, search_refit(problem, (), basin, config.refit, note), key=problem.discrepancy)
     except NotReplayed:
         before = problem.base
-    best = {m.keys: m for m in sorted([*done.tried, *alternatives], key=lambda m: m.refined.objective, reverse=True)}
-    return _decided(problem, before, done, list(best.values())), notes
+    lowest = {m.keys: m for m in sorted([*done.tried, *alternatives], key=lambda m: m.refined.objective, reverse=True)}
+    return _decided(problem, before, done, list(lowest.values())), notes
 
 
 def _collinear_candidates(done: SelectionStep, cosine: float) -> list[Proposal]:

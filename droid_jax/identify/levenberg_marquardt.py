@@ -206,8 +206,6 @@ def fall(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 class DampedProblem:
     """Residuals and prior in search coordinates, and the steps of an iteration; counts iterations and replays.
 
-    The Jacobian of the last iteration, corrected to its end, is kept (`last_jacobian`).
-
     residuals: [P, D] physical values -> [P, M].  space: meaning of the D entries.  config: settings.
     before: a problem whose counts are continued.
     """
@@ -222,7 +220,6 @@ class DampedProblem:
         self.log_width = np.array([p.log_width if p.scaling is Scaling.LOG else 0.0 for p in space.parameters])
         self.evaluations = before.evaluations if before else 0
         self.iterations = before.iterations if before else 0
-        self._last = np.zeros((0, len(space))), np.zeros((0, 0, len(space)))  # starts [S, D] and their Jacobian
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """Return search coordinates x, clipped to the bounds."""
@@ -282,7 +279,6 @@ class DampedProblem:
         before = state.objective
         self.iterations += 1
         state, jacobian = self.candidate_steps(state, jacobian, held)
-        self._last = state.x, jacobian
         curvature = np.einsum("smd,smd->sd", jacobian, jacobian) + self.prior**-2
         # About one conditional deviation wide; three for a start that did not move, to get another Jacobian.
         widths = np.where((state.objective < before)[:, None], 1.0, 3.0) / np.sqrt(curvature)
@@ -309,8 +305,10 @@ class DampedProblem:
             state, decrease = state.with_rows(active, now), fall(last.objective, now.objective)
             first = first if batch else decrease
             for k in np.flatnonzero(decrease > 0):  # at a start that did not move, central differences are better
-                points, known = np.vstack([last.x[k], candidates[k]]), np.vstack([last.residual[k], residual[k]])
-                steps, changes = points - now.x[k], known - now.residual[k]
+                # A step that raised the objective may have left the basin: its difference is no slope.
+                lower = self.objective(candidates[k], residual[k]) <= last.objective[k]
+                steps = np.vstack([last.x[k], candidates[k][lower]]) - now.x[k]
+                changes = np.vstack([last.residual[k], residual[k][lower]]) - now.residual[k]
                 wide = np.max(np.abs(steps), axis=1) >= self._config.smallest_step
                 jacobian[active[k]] = secant_slopes(
                     jacobian[active[k]], self.prior, steps[wide], changes[wide], self._config.secant_ridge
@@ -323,12 +321,6 @@ class DampedProblem:
     def jacobian(self, state: Starts) -> np.ndarray:
         """Return central differences [S, M, D] of every start from one batch; one-sided at a bound."""
         return self._slopes(*self.differences(*self._around(state.x, state.widths), state))
-
-    def last_jacobian(self, state: Starts) -> np.ndarray:
-        """Return the Jacobian [M, D] of one start: that of the last iteration if it ended there, else differences."""
-        starts, jacobians = self._last
-        at = np.flatnonzero(np.all(starts == state.x, axis=1))
-        return jacobians[at[0]] if len(at) else self.jacobian(state)[0]
 
     def _around(self, x: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points [S, D, D] a width above and below starts [S, D] along each axis, within bounds."""

@@ -33,6 +33,7 @@ from droid_jax.model.parameters import Parameter, Space
 
 Hypotheses = Sequence[Mapping[str, float]]
 
+SORTED = 2  # iterations after which starts near each other are in one basin: the first ones still share their misfit
 AT_BOUND = 1e-4  # search units; a parameter that is no further from a bound is not free
 
 
@@ -253,7 +254,7 @@ def refine(
         best=space.from_search(state.x[0]),
         objective=float(state.objective[0]),
         residual=state.residual[0],
-        jacobian=problem.wide_jacobian(state, problem.last_jacobian(state) if jacobian is None else jacobian),
+        jacobian=problem.wide_jacobian(state, problem.jacobian(state)[0] if jacobian is None else jacobian),
         prior=problem.prior,
         starts=ended,
         evaluations=problem.evaluations,
@@ -302,7 +303,7 @@ def chords(
         for k, (problem, look) in enumerate(zip(problems, looks, strict=True))
     }
     states = {k: problems[k].begun(begin[k], residual) for k, residual in replayed(begin).items()}
-    jacobians = {k: np.repeat(look.jacobian[None], len(begin[k]), axis=0) for k, look in enumerate(looks)}
+    jacobians = {k: np.broadcast_to(o.jacobian, (len(begin[k]), *o.jacobian.shape)) for k, o in enumerate(looks)}
     active = list(states)
     for _ in range(config.chords):
         trials = {k: problems[k].trials(states[k], jacobians[k]) for k in active}
@@ -365,7 +366,8 @@ class _Descent(DampedProblem):
                 self.ended = bool(decrease[best] > 0)
                 break
             good = state.objective <= ratios[min(number, len(ratios) - 1)] * state.objective[best]
-            good &= self.differs(state, state.rows([best])) | (np.arange(len(state.x)) == best)
+            if number >= SORTED:
+                good &= self.differs(state, state.rows([best])) | (np.arange(len(state.x)) == best)
             state, alive = state.rows(good), alive[good]
         return state.rows([int(np.argmin(state.objective))]), final
 
@@ -403,7 +405,7 @@ class _Descent(DampedProblem):
 
     def distant(self, state: Starts) -> list[str]:
         """Return the parameters of interest that are far from their initial means and hardly constrained."""
-        deviation = np.sqrt(np.diag(np.linalg.inv(curvature(self.last_jacobian(state), self.prior))))
+        deviation = np.sqrt(np.diag(np.linalg.inv(curvature(self.jacobian(state)[0], self.prior))))
         far = np.abs(state.x[0]) > self.config.reset_distance
         unconstrained = deviation > self.config.reset_deviation
         which = ~self.space.nuisance & far & unconstrained
@@ -417,7 +419,7 @@ class _Descent(DampedProblem):
         """
         settled, jacobian = hops == 0, None
         for number in range(hops):
-            jacobian = self.last_jacobian(state)
+            jacobian = self.jacobian(state)[0]
             hopped = self.hop(state, jacobian, number)
             excess = self.config.basin_hop_excess_tolerance * self.excess(state)[0]
             least = max(self.config.basin_hop_tolerance, excess)
