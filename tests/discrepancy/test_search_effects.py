@@ -253,6 +253,27 @@ def test_the_target_of_a_refit_is_the_best_objective_so_far(found: Small, monkey
     assert targets == [6.0, 6.0, 3.0]
 
 
+def test_a_candidate_whose_one_step_is_hopeless_against_the_best_refit_is_not_refitted(
+    found: Small, monkeypatch: pytest.MonkeyPatch
+):
+    """The base leaves 100.  One step reached 40, 60 and 99; the first refit reaches 10, which 60 - 5 * 40 may reach too
+    and 99 - 5 * 1 cannot."""
+    fitted = list[str]()
+
+    def refit(train: Any, base: Any, parts: Any, start: Any, config: Any) -> Any:
+        fitted.append(str(parts[0].key))
+        return SimpleNamespace(refined=SimpleNamespace(objective=10.0))
+
+    monkeypatch.setattr(candidate_fits, "refit", refit)
+    starts = [((part,), found.base.values) for part in candidates(found.case.effects)][:3]
+    names = [str(part.key) for (part,), _ in starts]
+    models, notes = staged_refit(problem_of(found), starts, 90.0, "not refitted", one_step=(100.0, [40.0, 60.0, 99.0]))
+    assert fitted == names[:2] and len(models) == 2 and notes == Notes()
+    fitted.clear()  # the first one is refitted whatever its step reached
+    staged_refit(problem_of(found), starts[:1], 10.0, "not refitted", one_step=(100.0, [99.0]))
+    assert fitted == names[:1]
+
+
 @pytest.mark.parametrize("blocks", [False, True])
 def test_the_target_is_half_of_the_gain_that_an_effect_must_reach(found: Small, blocks: bool):
     """An effect must reduce U = 4 by a fifth; the target is the objective with a tenth less."""
