@@ -70,11 +70,14 @@ def _add(spec: mujoco.MjSpec, kind: str, joint: str) -> None:
     spec.add_sensor(type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint)
 
 
+_COPIED = ("body_", "jnt_", "dof_", "geom_", "site_", "pair_", "actuator_", "eq_", "tendon_", "qpos")  # of an MjModel
+
+
 def _copy_numbers(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
     for name in (n for n in dir(source.opt) if not n.startswith("_")):
         setattr(target.opt, name, getattr(source.opt, name))
     for name in dir(source):
-        if name.startswith(("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")):
+        if name.startswith(_COPIED):
             array = getattr(source, name)
             if isinstance(array, np.ndarray) and array.size and np.issubdtype(array.dtype, np.number):
                 copied = getattr(target, name)
