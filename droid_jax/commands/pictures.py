@@ -39,7 +39,7 @@ def keep_replay(out: Path, found: Identified, recording: Recording) -> None:
     _forget(out)
     if not recording.command.size:
         return
-    scene = variant_scene(found.scene, recording.variant)
+    scene = variant_scene(found.scene, recording.variant, recording.name)
     drive = make_drive(scene, recording, weigh=False)
     every, factors = max(1, round(1.0 / (RATE * drive.timestep))), servo_factors(scene, drive)
     models = (

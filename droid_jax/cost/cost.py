@@ -31,7 +31,7 @@ from droid_jax.preflight.preflight import check_range, warn_if_moving, warn_of_c
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.recording import Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
-from droid_jax.simulate.compiled import Along, Driven, along_another, compiled_replay
+from droid_jax.simulate.compiled import Along, Driven, along_another, check_variant, compiled_replay
 from droid_jax.simulate.engine import ENGINES
 from droid_jax.simulate.initial_state import StartConfig, coupled_addresses
 from droid_jax.simulate.inverse_dynamics import motion_path, prescribed_joints
@@ -144,7 +144,8 @@ class Cost:
             raise ValueError("the replays were compiled with another mj_step: make another cost (`make_cost`)")
         comparisons, drives, replays = [], [], []
         for given, old, drive, replay in zip(recordings, self.comparisons, self.drives, self._replays, strict=True):
-            recording, scene = own_starts(given, (config or old.config).start), variant_scene(self.scene, given.variant)
+            scene = variant_scene(self.scene, given.variant, given.name)
+            recording = own_starts(given, (config or old.config).start)
             new = followed(scene, recording, config or old.config)
             if isinstance(new, Drive):
                 check_gains(scene, new)
@@ -162,7 +163,7 @@ class Cost:
     def from_one_start(self, index: int, recording: Recording) -> Recording:
         """Return a recording whose repeats all start where replay `index` does (`repeat_starts.from_one_start`)."""
         config = self.comparisons[index].config.start
-        recording, scene = own_starts(recording, config), variant_scene(self.scene, recording.variant)
+        recording, scene = own_starts(recording, config), variant_scene(self.scene, recording.variant, recording.name)
         return _from_one_start(scene, self.space, recording, self.drives[index], self._replays[index], config)
 
     def _blockwise(self, values: Any, functions: Sequence[Callable], join: Callable) -> Any:
@@ -209,12 +210,14 @@ def make_cost(
     recordings, effects = recordings_of(recordings), instances(effects, "effects", Effect)
     one_of(engine, "engine", ENGINES)
     recordings = [own_starts(recording, config.start) for recording in recordings]
-    scenes = [variant_scene(scene, r.variant) for r in recordings]
+    scenes = [variant_scene(scene, r.variant, r.name) for r in recordings]
     drives = [followed(own, r, config) for own, r in zip(scenes, recordings, strict=True)]
     for recording in recordings if check else ():
         warn_of_log(scene, recording)
     check_read(scene, space, effects)
     check_inertia(scene, space)
+    for own, recording in zip(scenes, recordings, strict=True):
+        check_variant(own, space, effects, recording.name)
     commanded = any(isinstance(drive, Drive) for drive in drives)
     if not commanded:
         _warn_of_commanded(space)

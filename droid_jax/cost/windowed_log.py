@@ -27,6 +27,7 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Phase, Recording
+from droid_jax.simulate.compiled import check_variant
 from droid_jax.simulate.replay import Drive
 from droid_jax.simulate.windows import TooShort, WindowConfig, why_no_windows
 
@@ -283,11 +284,12 @@ def windowed_log(
     check_read(scene, space, effects)
     check_friction_rows(scene, space, effects)
     check_inertia(scene, space)
-    scenes = [variant_scene(scene, recording.variant) for recording in recordings]
+    scenes = [variant_scene(scene, recording.variant, recording.name) for recording in recordings]
     reasons = [why_no_windows(scene, recording) for recording in recordings]
     why = "motions were asked for whole" if whole else next((r for r in reasons if r), "")
     drives = list[Drive]()
     for own, recording in zip(scenes, recordings, strict=True):
+        check_variant(own, space, effects, recording.name)
         drive = followed(own, recording, config)
         assert isinstance(drive, Drive)
         drives.append(drive)

@@ -111,7 +111,7 @@ def additions(scene: Scene, recording: Recording, config: ProposalConfig = DEFAU
     """
     if scene.object_joint is not None or scene.grip is not None:
         return ()
-    scene = variant_scene(scene, recording.variant)
+    scene = variant_scene(scene, recording.variant, recording.name)
     joints, start = _start(scene, recording)
     step = float(np.median(np.diff(recording.time))) if recording.command.size else 1.0 / config.rate
     time = np.arange(round(config.seconds / step) + 1) * step
@@ -248,6 +248,7 @@ def _information(
 
 def motion_recording(scene: Scene, recording: Recording, addition: Addition, name: str) -> Recording:
     """Return an addition as a recording of one repeat, with placeholder measurements: only its replay is used."""
+    scene = variant_scene(scene, recording.variant, recording.name)
     joints, start = _start(scene, recording)
     table = np.tile(start, (len(addition.time), 1))
     table[:, joints.index(addition.joint)] = addition.path

@@ -34,7 +34,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Channel, Recording, recordings_of
 from droid_jax.simulate.batching import in_blocks
-from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.compiled import check_variant, compiled_replay
 from droid_jax.simulate.engine import choose_engine
 from droid_jax.simulate.initial_state import check_weight, start_pose
 from droid_jax.simulate.repeat_starts import own_starts
@@ -101,7 +101,8 @@ def evaluate_on(
     if engine == "auto":
         engine = choose_engine(scene, space, recordings, effects).engine
     for given in recordings:
-        recording, own = own_starts(given, config.start), variant_scene(scene, given.variant)
+        recording, own = own_starts(given, config.start), variant_scene(scene, given.variant, given.name)
+        check_variant(own, space, effects, given.name)
         informative_channels(scene, [recording])
         compared = _with_comparable_torques(own, recording, config)
         channels = dict.fromkeys(measured_channels(scene, compared), 1.0)

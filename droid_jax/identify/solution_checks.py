@@ -178,7 +178,7 @@ def creep_of_fit(scene: Scene, space: Space, best: np.ndarray, recordings: Seque
     """Return notes about joints that creep with the fitted values `best` [D] but not with the scene's values."""
     notes = list[str]()
     for recording in recordings:
-        own = variant_scene(scene, recording.variant)
+        own = variant_scene(scene, recording.variant, recording.name)
         fitted = make_c_model(own, space, space.with_known(recording.known, best))
         if not creep_note(own, recording) and (text := creep_note(own, recording, fitted)):
             notes.append(text)

@@ -12,6 +12,7 @@ import copy
 import functools
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +20,8 @@ import mujoco
 import numpy as np
 
 from droid_jax.arguments import lists_of_numbers, shown
-from droid_jax.model.parameters import Mode, Space
+from droid_jax.model.effect_interface import Effect
+from droid_jax.model.parameters import Mode, Space, Write
 from droid_jax.model.physics import DERIVED, UNIT, model_writes, settle
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 from droid_jax.model.unsupported_features import refuse_ignored
@@ -60,17 +62,32 @@ TOLD = 4  # numbers that a sentence names
 _CLOSE = 1e-6  # relative, of numbers that were derived twice
 
 
-def variant_scene(scene: Scene, numbers: Numbers) -> Scene:
+def variant_scene(scene: Scene, numbers: Numbers, recording: str = "") -> Scene:
     """The scene with the numbers that a recording states, the same object each time; itself where it states none.
 
-    Raises ValueError for fields, elements or counts of numbers that the scene does not have.
+    Raises ValueError, with the name of the recording, for fields, elements or counts of numbers that the scene does not
+    have.
     """
     key = json.dumps(lists_of_numbers(numbers), sort_keys=True) if numbers else ""
     if scene.variant == key:
         return scene
-    if scene.variant:
-        raise ValueError(f"scene {scene.name!r} has the numbers of another recording already: give the scene as loaded")
-    return _made(scene, key)
+    with of_recording(recording):
+        if scene.variant:
+            raise ValueError(
+                f"scene {scene.name!r} has the numbers of another recording already: give the scene as loaded"
+            )
+        return _made(scene, key)
+
+
+@contextmanager
+def of_recording(name: str) -> Iterator[None]:
+    """Begin errors about a variant with the name of its recording, if it is known."""
+    try:
+        yield
+    except ValueError as error:
+        if not name:
+            raise
+        raise ValueError(f"recording {name!r}: {str(error).removeprefix('a recording ')}") from error
 
 
 @functools.lru_cache(maxsize=64)
@@ -237,19 +254,31 @@ def _where(model: mujoco.MjModel, field: str, here: np.ndarray, there: np.ndarra
     return f"{field} of {next((n for i, n in enumerate(names) if off[_rows(model, field, i)].any()), '?')}"
 
 
-def check_writes(scene: Scene, space: Space) -> None:
+def check_writes(scene: Scene, space: Space, effects: Sequence[Effect] = ()) -> None:
     """Raise ValueError for parameters that would write over numbers that the recording of a variant states."""
+    effect_of = {p.name: effect.name for effect in effects for p in effect.parameters}
     stated = set[tuple[str, int]]()
     for field, name, _ in _stated(scene.variant):
         rows = _entries(scene, field, name)[1]
         stated |= {(field, row) for row in range(rows.start, rows.stop)}
     for column, write in model_writes(space):
-        if (write.field, write.index[0]) in stated and (write.mode in (Mode.SET, Mode.NEGATIVE) or write.offset):
+        if (write.field, write.index[0]) in stated and not _relative(write):
+            effect = effect_of.get(space.names[column])
             raise ValueError(
-                f"parameter {space.names[column]!r} sets {write.field} of {write.element!r}, which a recording states "
-                '(variant): leave the parameter out, let it scale the number or add to it ("mode"), or state its value '
-                "as known in place of the variant"
+                f"parameter {space.names[column]!r} sets {write.field} of {write.element!r}, which the recording "
+                "states (variant): "
+                + (
+                    f"leave the effect out (--without {effect})"
+                    if effect
+                    else 'leave the parameter out, let it scale the number or add to it ("mode"), or state its value '
+                    "as known in place of the variant"
+                )
             )
+
+
+def _relative(write: Write) -> bool:
+    """Whether a write changes any number alike; a gain with an offset is made for the MJCF's, as 1 + value / mass."""
+    return write.mode not in (Mode.SET, Mode.NEGATIVE) and (not write.offset or write.gain == 1.0)
 
 
 def variant_text(numbers: Numbers) -> str:

@@ -41,7 +41,7 @@ def check_log(scene: Scene, recording: Recording) -> tuple[Finding, ...]:
     Returns:
         The findings; empty if nothing is wrong, or if the measurements are too few for a check.
     """
-    scene = variant_scene(scene, recording.variant)
+    scene = variant_scene(scene, recording.variant, recording.name)
     known = _FOUND.setdefault(recording, weakref.WeakKeyDictionary())
     if scene not in known:
         found = [*check_alone(recording, clocks=False), *check_clocks(scene, recording)]

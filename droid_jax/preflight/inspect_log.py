@@ -36,7 +36,7 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
     if scene is None:
         return _sorted(check_alone(recording))
     try:
-        scene = variant_scene(scene, recording.variant)
+        scene = variant_scene(scene, recording.variant, recording.name)
     except ValueError as error:
         return _sorted([*check_alone(recording), Finding("scene", "", 0.0, 0.0, "certain", str(error))])
     found: list[Finding] = []

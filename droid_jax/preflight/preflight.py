@@ -31,7 +31,7 @@ def command_notes(scene: Scene, recording: Recording) -> list[str]:
     They concern actuators without position feedback, servos with a gear, actuators without commands, gains and numbers
     that differ from the scene's, open loops, commands and torques beyond limits, and joints that creep.
     """
-    scene = variant_scene(scene, recording.variant)
+    scene = variant_scene(scene, recording.variant, recording.name)
     said = (
         open_loop(scene, recording),
         geared(scene, recording),

@@ -78,7 +78,7 @@ def simulated_channels(
     Raises:
         ValueError: the simulation blows up, or plain C does not support the model.
     """
-    scene = variant_scene(scene, recording.variant)
+    scene = variant_scene(scene, recording.variant, recording.name)
     drive = followed(scene, recording, config.compare)
     replay = compiled_replay(engine, scene, space, drive, effects)
     rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
@@ -323,7 +323,7 @@ def robot_trace(
         torque_drift=(0.0, 0.0), position_noise=0.0, angle_noise=0.0, angle_rate=rehearsal.robot_rate, start_noise=0.0,
         pose_noise=0.0, side=recording.torque.side,
     )  # fmt: skip
-    scene = variant_scene(scene, recording.variant)
+    scene = variant_scene(scene, recording.variant, recording.name)
     drive = followed(scene, recording, config.compare)
     assert isinstance(drive, Drive)
     robot = replace(scene, model=scale_gains(copy.copy(scene.model), servo_factors(scene, drive)))

@@ -26,7 +26,7 @@ from droid_jax.model.parameters import Role, Space, Write
 from droid_jax.model.physics import make_physics, theta_of
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import refuse_fluid
-from droid_jax.model.variant import check_writes
+from droid_jax.model.variant import check_writes, of_recording
 from droid_jax.recordings.recording import TorqueConvention
 from droid_jax.simulate.batching import over_block
 from droid_jax.simulate.c_reference import c_path_torques, c_replay, why_no_path_in_c
@@ -132,7 +132,7 @@ def compiled_replay(
             states.
     """
     scene.check_unchanged()
-    check_writes(scene, space)
+    check_variant(scene, space, effects)
     space.with_known(follows.known, space.mean)  # raise here, not at the first call
     effects, layout = with_sensors(scene, space, follows, effects), layout_of(space)
     if isinstance(follows, Motion):
@@ -169,6 +169,16 @@ def compiled_replay(
     return Driven(in_c, follows)
 
 
+def check_variant(scene: Scene, space: Space, effects: Sequence[Effect], recording: str = "") -> None:
+    """Raise ValueError for parameters and effects that the variant of a recording cannot have.
+
+    scene: with the recording's numbers.  space: of the replay.  effects: in it.  recording: its name, if it is known.
+    """
+    with of_recording(recording):
+        check_writes(scene, space, effects)
+        in_variant(scene, tuple(effects))
+
+
 def window_program(
     scene: Scene, space: Space, drive: Drive, effects: Sequence[Effect], earlier: int, steps: int
 ) -> Callable[..., Rollout]:
@@ -187,7 +197,7 @@ def window_program(
         Rollout [B, steps, ...].
     """
     scene.check_unchanged()
-    check_writes(scene, space)
+    check_variant(scene, space, effects)
     check_gains(scene, drive)
     made_with = with_sensors(scene, space, drive, effects)
     clocked = Clocked(drive.timestep, drive.torque, drive)

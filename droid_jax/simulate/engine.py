@@ -64,7 +64,7 @@ def choose_engine(
         return EngineChoice("mjx", "repeats resolve the error of C's first-order steps")
     if scene.grip is not None or scene.model.npair:
         return EngineChoice("mjx", "contact pairs need its second-order step")
-    reasons = [why_not_in_c(variant_scene(scene, r.variant), space, r.torque, effects) for r in recordings]
+    reasons = [why_not_in_c(variant_scene(scene, r.variant, r.name), space, r.torque, effects) for r in recordings]
     if reason := next(filter(None, reasons), None):
         return EngineChoice("mjx", reason)
     case = f"for {samples} samples a batch" if accelerated else "on a CPU"

@@ -142,17 +142,20 @@ def ready(scene: Scene) -> Scene:
 def in_variant(scene: Scene, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """The effects with the laws that they have in a scene with the numbers of one recording (`model.variant`).
 
-    A law may hold numbers of the scene that it was made for, such as where a load hangs.  Their parameters stay.
-    Raises ValueError for an effect that such a scene cannot have.
+    A law may hold numbers of the scene that it was made for, such as where a load hangs.  Their parameters stay, and
+    so do effects without laws.  Raises ValueError for an effect with a law that such a scene cannot have.
     """
     if not scene.variant:
         return effects
     found = list[Effect]()
     for effect in effects:
         made = _MAKERS[effect.name](scene) if effect.name in _MAKERS else effect
-        if made is None:
-            raise ValueError(f"scene {scene.name!r} cannot have the effect {effect.name!r} with a recording's variant")
-        found.append(replace(effect, **{law: getattr(made, law) for law in LAWS}))
+        if made is None and any(getattr(effect, law) is not None for law in LAWS):
+            raise ValueError(
+                f"scene {scene.name!r} with the recording's numbers (variant) cannot have the effect {effect.name!r}: "
+                f"leave it out (--without {effect.name})"
+            )
+        found.append(replace(effect, **{law: getattr(made, law) for law in LAWS}) if made is not None else effect)
     return tuple(found)
 
 
