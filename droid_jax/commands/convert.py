@@ -76,7 +76,7 @@ class Convert:
     the parameter that replaces it in this recording, e.g. payload=tool."""
     variant: Path | None = None
     """MJCF of this recording alone: that of --scene with other numbers (another mounting, a payload). The recording
-    keeps the numbers that differ, and its replays have them."""
+    keeps the numbers that differ, in place of earlier ones, and its replays have them."""
     scene: Path | None = None
     """MJCF that fits will be made with, for --variant."""
     base_pose: tuple[str, float, float, float, float, float, float, float] | None = None
@@ -238,20 +238,33 @@ def _known(words: tuple[str, ...]) -> dict[str, float | str]:
 
 def _variant(command: Convert, recording: Recording) -> dict[str, dict[str, Any]]:
     """What the recording states already, or --variant, and --base-pose: numbers by field and element."""
-    numbers = {field: dict(of) for field, of in recording.variant.items()}
+    from droid_jax.arguments import lists_of_numbers
+
+    before: dict[str, dict[str, Any]] = dict(lists_of_numbers(recording.variant))
+    numbers = {field: dict(of) for field, of in before.items()}
     if (command.variant is None) != (command.scene is None):
         raise ValueError("--variant and --scene go together: the MJCF of this recording, and that of the fit")
     if command.variant is not None and command.scene is not None:
         from droid_jax.model.scene import load_scene
-        from droid_jax.model.variant import numbers_that_differ, variant_text
+        from droid_jax.model.variant import numbers_that_differ
 
         scene, variant = (load_scene(path, engine="mujoco") for path in (command.scene, command.variant))
         numbers = numbers_that_differ(scene, variant)
-        print(f"{command.variant} has other numbers than {command.scene}: {variant_text(numbers) or 'none'}")
     if command.base_pose is not None:
         body, *pose = command.base_pose
+        if body == "world":
+            raise ValueError("--base-pose world: the world does not move: name the robot's first body")
+        if not any(pose[3:]):
+            raise ValueError("--base-pose: the quaternion w x y z has length 0; 1 0 0 0 turns nothing")
         for field, value in (("body_pos", pose[:3]), ("body_quat", pose[3:])):
             numbers.setdefault(field, {})[body] = value
+    if command.variant is not None or command.base_pose is not None:
+        from droid_jax.model.variant import variant_text
+
+        print(f"numbers of this recording alone: {variant_text(numbers) or 'none'}")
+        dropped = {f: {n: v for n, v in of.items() if numbers.get(f, {}).get(n) != v} for f, of in before.items()}
+        if text := variant_text(dropped):
+            print(f"numbers that it stated earlier, which are dropped: {text}")
     return numbers
 
 
