@@ -23,7 +23,8 @@ class EvaluateFit:
     fit: Path = Path("runs/identify")
     """Folder of a finished `identify`, `gap` or `all`. Of `all` the extended model is used, if there is one."""
     scene: Path | None = None
-    """MJCF to evaluate in, if the fitted one has moved or another variant is wanted. Default: the fitted one."""
+    """MJCF to evaluate in, if the fitted one has moved or another MJCF is wanted; a recording's own variant is applied
+    anyway. Default: the fitted one."""
     user_effects: Path | None = None
     """Python file that registers your own effects, if the fit has some; it is executed."""
     out: Path = Path("runs/evaluation")

@@ -35,6 +35,7 @@ PATHS = (
     "run",
     *HASHED,
 )  # options with paths; a setup also has the content's hash
+SHOWN = {"judge_on": "test-recording"}  # options whose name on the command line is another
 INPUTS = ("start", "synthetic_robot")  # entries of a setup from other runs, like all that end in _sha256
 
 
@@ -87,7 +88,8 @@ class OtherRun(ValueError):
     def __init__(self, out: Path, changed: Iterable[str]) -> None:
         changed = tuple(changed)
         self.inputs = all(name in INPUTS or name.endswith("_sha256") for name in changed)
-        self.what = f"{out} holds a run with other settings ({', '.join(c.removesuffix('_sha256') for c in changed)})"
+        names = (name.removesuffix("_sha256") for name in changed)
+        self.what = f"{out} holds a run with other settings ({', '.join(SHOWN.get(name, name) for name in names)})"
         super().__init__(f"{self.what}; choose another --out, or --again")
 
 
