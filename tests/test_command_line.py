@@ -266,6 +266,8 @@ def test_a_run_that_was_stopped_may_get_another_budget(tmp_path: Path):
     assert not finished(tmp_path, {"budget": 5.0, "seed": 1}, False, "gap.json")
     with pytest.raises(OtherRun, match=r"other settings \(seed\)"):
         finished(tmp_path, {"budget": 5.0, "seed": 2}, False, "gap.json")
+    with pytest.raises(OtherRun, match=r"other settings \(test-recording\)"):
+        finished(tmp_path, {"budget": 5.0, "seed": 1, "judge_on_sha256": ["a"]}, False, "gap.json")
     (tmp_path / "gap.json").write_text("{}")
     with pytest.raises(OtherRun, match=r"other settings \(budget\)"):
         finished(tmp_path, {"budget": 5.0, "seed": 1}, False, "gap.json")

@@ -33,6 +33,7 @@ from droid_jax.preflight.inspect_log import inspect_log
 from droid_jax.recordings.formats import load_recording, save_recording
 from droid_jax.recordings.recording import Recording
 from droid_jax.run import main
+from droid_jax.simulate.c_engine import instrument
 from droid_jax.simulate.windows import WindowConfig
 
 LOAD, TILT = 0.3, 0.5  # kg, rad
@@ -193,7 +194,8 @@ def test_a_variant_equals_its_mjcf(setups: SimpleNamespace):
         other = compiled(**numbers)
         for one, two in ((base, other), (other, base)):
             own = variant_scene(one, numbers_that_differ(one, two))
-            np.testing.assert_array_equal(state(own.model), state(two.model))
+            for model in (own.model, instrument(own)):
+                np.testing.assert_array_equal(state(model), state(two.model))
             assert np.abs(state(one.model) - state(two.model)).max() > 1e-3
             assert variant_scene(own, numbers_that_differ(one, two)) is own
 
@@ -211,8 +213,12 @@ def test_parameters_act_on_the_numbers_that_a_recording_states(setups: SimpleNam
     ):
         for log in (replace(setups.logs["empty"], variant=of), bare(replace(setups.logs["empty"], variant=of))):
             config = CompareConfig(channels={"torque": 1.0})
-            with pytest.raises(ValueError, match=f"{where}.*which a recording states.*let it scale"):
+            with pytest.raises(ValueError, match=f"'empty': .*{where}.*which the recording states.*let it scale"):
                 make_cost(scene, given, log, engine="mujoco", config=config, check=False)
+    user = Effect("user", own.parameters)
+    with pytest.raises(ValueError, match=r"sets body_mass.*leave the effect out \(--without user\)"):
+        config = CompareConfig(channels={"position": 1.0})
+        make_cost(scene, own, setups.logs["loaded"], engine="mujoco", config=config, effects=[user], check=False)
     with pytest.raises(ValueError, match="numbers of another recording already"):
         variant_scene(variant_scene(scene, stated), setups.logs["tilted"].variant)
 
@@ -228,6 +234,26 @@ def test_effects_have_the_laws_of_the_variant(setups: SimpleNamespace):
     assert effects[0].force is not None and moved.force is not None
     on_earth = np.asarray(effects[0].force(theta, state))
     np.testing.assert_allclose(np.asarray(moved.force(theta, state)), on_earth * 1.62 / 9.81, rtol=1e-5)
+
+
+def test_relative_effects_act_on_the_gain_that_a_recording_states(setups: SimpleNamespace):
+    scene, kp = setups.scene, 2.0
+    stated = numbers_that_differ(scene, scene_of(arm(), kp=kp))
+    effects = library(scene, ["servo_gain"])
+    space = effect_space(effects)
+    log = replace(setups.logs["empty"], variant=stated, gains=None)
+    make_cost(scene, space, log, engine="mujoco", config=CompareConfig(channels={"position": 1.0}), effects=effects)
+    model = make_c_model(variant_scene(scene, stated), space, np.array([0.1]))
+    assert model.actuator_gainprm[0, 0] == -model.actuator_biasprm[0, 1] == pytest.approx(1.1 * kp)
+
+
+def test_effects_that_the_scene_of_a_variant_would_not_get(setups: SimpleNamespace):
+    """Without weight an encoder's zero changes nothing, and a load has no moment."""
+    own = variant_scene(setups.scene, {"opt": {"gravity": [0.0, 0.0, 0.0]}})
+    offset, load = library(setups.scene, ["encoder_offset", "free_payload"])
+    assert library(own, ["encoder_offset", "free_payload"]) == () and in_variant(own, (offset,)) == (offset,)
+    with pytest.raises(ValueError, match=r"'free_payload': leave it out \(--without free_payload\)"):
+        in_variant(own, (load,))
 
 
 def test_findings_and_evaluations_are_of_the_variant(setups: SimpleNamespace):
@@ -270,7 +296,10 @@ def test_what_is_no_variant_is_refused(setups: SimpleNamespace, change, said: st
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ({"body_mass": {"hand": 1.0}}, "no such body; it has: world, base, arm, payload"),
+        (
+            {"body_mass": {"hand": 1.0}},
+            "recording 'empty': states body_mass of 'hand'.*no such body; it has: world, base, arm, payload",
+        ),
         ({"body_mass": {"arm": [1.0, 2.0]}}, "states 2 numbers of body_mass of 'arm'"),
         ({"body_subtreemass": {"arm": 1.0}}, "'body_subtreemass'.*is no number"),
         ({"body_quat": {"base": [0, 0, 0, 0]}}, "body_quat of 'base' .*length 0"),
@@ -302,12 +331,20 @@ def test_convert_states_a_variant_and_the_pose_of_the_base(
     mjcf = ["--scene", str(tmp_path / "arm.xml"), "--variant", str(tmp_path / "loaded.xml")]
     pose = ["--base-pose", "base", "0", "-0.1", "0.5", "0.8", "0", "0.6", "0"]
     assert main([*words, *mjcf]) == 0
-    assert "has other numbers than" in capsys.readouterr().out
+    assert "numbers of this recording alone: body_inertia of payload" in capsys.readouterr().out
     found = load_recording(tmp_path / "out.npz")
     assert found.variant == setups.logs["loaded"].variant and found.sha256 == setups.logs["loaded"].sha256
     assert main([*words, *mjcf, *pose]) == 0
     expected = {"body_pos": {"base": [0.0, -0.1, 0.5]}, "body_quat": {"base": [0.8, 0.0, 0.6, 0.0]}}
     assert load_recording(tmp_path / "out.npz").variant == {**setups.logs["loaded"].variant, **expected}
-    capsys.readouterr()
-    assert main([*words, *mjcf[2:]]) == 2
-    assert re.search("--variant and --scene go together", capsys.readouterr().err)
+    assert "dropped" not in capsys.readouterr().out
+    save_recording(load_recording(tmp_path / "out.npz"), tmp_path / "log.npz")
+    assert main([*words, *mjcf]) == 0
+    assert "earlier, which are dropped: body_pos of base 0 -0.1 0.5, body_quat of base 0.8" in capsys.readouterr().out
+    for wrong, said in (
+        (mjcf[2:], "--variant and --scene go together"),
+        (["--base-pose", "world", *pose[2:]], "the world does not move: name the robot's first body"),
+        ([*pose[:5], "0", "0", "0", "0"], "the quaternion w x y z has length 0"),
+    ):
+        assert main([*words, *wrong]) == 2
+        assert re.search(said, capsys.readouterr().err)
