@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from droid_jax.arguments import check_fields, number, several, whole
+from droid_jax.arguments import check_fields, number, optional, several, whole
 from droid_jax.model.parameters import Scaling, Space
 
 Residuals = Callable[[np.ndarray], np.ndarray]
@@ -38,7 +38,8 @@ class LevenbergMarquardtConfig:
     chord: where a Jacobian is not corrected (`multistart.chords`), share of the objective by which a batch of candidate
       steps must lower it for another batch.
     chords: largest number of batches between two batches of differences.
-    secant_ridge: ridge of the correction of a Jacobian, which limits the effect of two nearly parallel steps.
+    secant_ridge: ridge of the correction of a Jacobian, which limits the effect of two nearly parallel steps; None: no
+      correction, and `chord` decides about another batch.
     dampings: factors on the last damping in a batch of candidate steps.  With `lengths` and both paths these are 32
       steps, the size of a block of rows on a CPU in MJX.
     lengths: factors on the full step in a batch of candidate steps.
@@ -57,7 +58,7 @@ class LevenbergMarquardtConfig:
     main_prior: float = 4.0
     chord: float = 0.03
     chords: int = 6
-    secant_ridge: float = 0.01
+    secant_ridge: float | None = 0.01
     dampings: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3, 1e4)
     lengths: tuple[float, ...] = (1.0, 0.5)
     first_damping: float = 1e-3
@@ -78,7 +79,7 @@ class LevenbergMarquardtConfig:
             least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
             chords=partial(whole, least=1),
-            secant_ridge=partial(number, above=0),
+            secant_ridge=optional(partial(number, above=0)),
             dampings=several(partial(number, above=0)),
             lengths=several(partial(number, above=0, most=1)),
             spreads=partial(whole, least=0),
@@ -291,11 +292,11 @@ class DampedProblem:
         """Take batches of candidate steps from a Jacobian [S, M, D]; return the starts and their corrected Jacobian.
 
         A start gets another batch if the last one decreased its objective enough.  The decrease for each replay must be
-        that of the first batch, whose replays include the differences.
+        that of the first batch, whose replays include the differences.  Without corrections see `paid`.
 
         held: [S, D] bool, coordinates that stay fixed.
         """
-        replays = self._config.trials, self._config.trials + 2 * len(self.space)
+        replays, ridge = (self._config.trials, self._config.trials + 2 * len(self.space)), self._config.secant_ridge
         active, first, jacobian = np.arange(len(state.x)), np.zeros(len(state.x)), jacobian.copy()
         for batch in range(self._config.chords):
             last = state.rows(active)
@@ -303,6 +304,10 @@ class DampedProblem:
             residual = self.replay(candidates.reshape(-1, candidates.shape[-1])).reshape(*candidates.shape[:2], -1)
             now = self.taken(last, candidates, residual)
             state, decrease = state.with_rows(active, now), fall(last.objective, now.objective)
+            if ridge is None:
+                if not self.paid(last, now):
+                    break
+                continue
             first = first if batch else decrease
             for k in np.flatnonzero(decrease > 0):  # at a start that did not move, central differences are better
                 # A step that raised the objective may have left the basin: its difference is no slope.
@@ -310,9 +315,7 @@ class DampedProblem:
                 steps = np.vstack([last.x[k], candidates[k][lower]]) - now.x[k]
                 changes = np.vstack([last.residual[k], residual[k][lower]]) - now.residual[k]
                 wide = np.max(np.abs(steps), axis=1) >= self._config.smallest_step
-                jacobian[active[k]] = secant_slopes(
-                    jacobian[active[k]], self.prior, steps[wide], changes[wide], self._config.secant_ridge
-                )
+                jacobian[active[k]] = secant_slopes(jacobian[active[k]], self.prior, steps[wide], changes[wide], ridge)
             active = active[(decrease > 0) & (decrease * replays[1] >= first[active] * replays[0])]
             if not len(active):
                 break

@@ -129,13 +129,16 @@ class RefineInCConfig:
 
     In C there are no blocks of rows to fill, so fewer candidate steps are cheaper.  There are no contact pairs, whose
     sticking and slipping makes small basins, so no searches for better basins are needed.  In double precision one pass
-    over the posterior's axes gives the final Jacobian.
+    over the posterior's axes gives the final Jacobian.  Corrected Jacobians save hardly any replays
+    beside so few candidate steps.
 
-    dampings, lengths, patience, basin_hops, spreads: see `RefineConfig`.
+    dampings, lengths, chords, secant_ridge, patience, basin_hops, spreads: see `RefineConfig`.
     """
 
     dampings: tuple[float, ...] = (0.1, 1.0, 10.0, 1e3)
     lengths: tuple[float, ...] = (1.0,)
+    chords: int = 3
+    secant_ridge: float | None = None
     patience: int = 2
     basin_hops: int = 0
     spreads: int = 1

@@ -596,15 +596,15 @@ def test_short_steps_correct_the_slopes_more_than_long_ones():
 
 
 def test_corrected_slopes_save_replays():
-    """A chain of Rosenbrock's valleys: 1,233 replays with the correction, 1,553 without."""
+    """A chain of Rosenbrock's valleys: 1,137 replays with corrections, 2,289 without."""
     space = Space(tuple(line(name) for name in "abcdefgh"))
 
     def chain(x: np.ndarray) -> np.ndarray:
         return np.concatenate([10.0 * (x[:, 1:] - x[:, :-1] ** 2), 1.0 - x[:, :-1]], axis=1)
 
     counts = {}
-    for ridge in (1e-2, 1e12):  # the second corrects nothing
+    for ridge in (1e-2, None):
         fit = refine(chain, space, np.zeros(8), dataclasses.replace(FLAT, secant_ridge=ridge, iterations=60))
         np.testing.assert_allclose(fit.best, 1.0, atol=1e-4)
         counts[ridge] = fit.evaluations
-    assert counts[1e-2] < 0.85 * counts[1e12], counts
+    assert counts[1e-2] < 0.7 * counts[None], counts
