@@ -194,7 +194,7 @@ class DiscrepancyConfig:
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=CONVERGE_ITERATIONS))
     refit: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0))
     one_step: LevenbergMarquardtConfig = field(
-        default_factory=lambda: replace(LevenbergMarquardtConfig(), **FEWER_TRIALS, chords=3)
+        default_factory=lambda: replace(LevenbergMarquardtConfig(), **FEWER_TRIALS)
     )
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
     one_step_fits: int = 12

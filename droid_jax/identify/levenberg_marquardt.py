@@ -35,9 +35,11 @@ class LevenbergMarquardtConfig:
     longest_step: largest component of a candidate step, search units, within which the residuals are about linear.
     least_ratio: smallest factor on a parameter of a path that is straight in physical units.
     main_prior: prior deviation of parameters of interest, search units.
-    chord: where a Jacobian is not corrected (`multistart.chords`), share of the objective by which a batch of candidate
-      steps must lower it for another batch.
-    chords: largest number of batches between two batches of differences.
+    chord: where a Jacobian is not corrected, share of the objective by which a batch of candidate steps must lower it
+      for another batch.
+    chords: largest number of batches with one uncorrected Jacobian.
+    corrected_batches: largest number of batches with a Jacobian that each of them corrects.  This is done where
+      differences take more replays than a batch of candidate steps; else new differences are as cheap.
     secant_ridge: ridge of the correction of a Jacobian, which limits the effect of two nearly parallel steps; None: no
       correction, and `chord` decides about another batch.
     dampings: factors on the last damping in a batch of candidate steps.  With `lengths` and both paths these are 32
@@ -57,7 +59,8 @@ class LevenbergMarquardtConfig:
     least_ratio: float = 0.05
     main_prior: float = 4.0
     chord: float = 0.03
-    chords: int = 6
+    chords: int = 3
+    corrected_batches: int = 6
     secant_ridge: float | None = 0.01
     dampings: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2, 1e3, 1e4)
     lengths: tuple[float, ...] = (1.0, 0.5)
@@ -79,6 +82,7 @@ class LevenbergMarquardtConfig:
             least_ratio=partial(number, above=0, most=1),
             chord=partial(number, least=0),
             chords=partial(whole, least=1),
+            corrected_batches=partial(whole, least=1),
             secant_ridge=optional(partial(number, above=0)),
             dampings=several(partial(number, above=0)),
             lengths=several(partial(number, above=0, most=1)),
@@ -296,9 +300,11 @@ class DampedProblem:
 
         held: [S, D] bool, coordinates that stay fixed.
         """
-        replays, ridge = (self._config.trials, self._config.trials + 2 * len(self.space)), self._config.secant_ridge
+        config, differences = self._config, 2 * len(self.space)
+        replays = config.trials, config.trials + differences
+        ridge = config.secant_ridge if differences > config.trials else None
         active, first, jacobian = np.arange(len(state.x)), np.zeros(len(state.x)), jacobian.copy()
-        for batch in range(self._config.chords):
+        for batch in range(config.chords if ridge is None else config.corrected_batches):
             last = state.rows(active)
             candidates = self.trials(last, jacobian[active], None if held is None else held[active])
             residual = self.replay(candidates.reshape(-1, candidates.shape[-1])).reshape(*candidates.shape[:2], -1)
@@ -314,7 +320,7 @@ class DampedProblem:
                 lower = self.objective(candidates[k], residual[k]) <= last.objective[k]
                 steps = np.vstack([last.x[k], candidates[k][lower]]) - now.x[k]
                 changes = np.vstack([last.residual[k], residual[k][lower]]) - now.residual[k]
-                wide = np.max(np.abs(steps), axis=1) >= self._config.smallest_step
+                wide = np.max(np.abs(steps), axis=1) >= config.smallest_step
                 jacobian[active[k]] = secant_slopes(jacobian[active[k]], self.prior, steps[wide], changes[wide], ridge)
             active = active[(decrease > 0) & (decrease * replays[1] >= first[active] * replays[0])]
             if not len(active):

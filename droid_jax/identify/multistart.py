@@ -132,12 +132,11 @@ class RefineInCConfig:
     over the posterior's axes gives the final Jacobian.  Corrected Jacobians save hardly any replays
     beside so few candidate steps.
 
-    dampings, lengths, chords, secant_ridge, patience, basin_hops, spreads: see `RefineConfig`.
+    dampings, lengths, secant_ridge, patience, basin_hops, spreads: see `RefineConfig`.
     """
 
     dampings: tuple[float, ...] = (0.1, 1.0, 10.0, 1e3)
     lengths: tuple[float, ...] = (1.0,)
-    chords: int = 3
     secant_ridge: float | None = None
     patience: int = 2
     basin_hops: int = 0

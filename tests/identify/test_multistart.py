@@ -404,7 +404,7 @@ def test_a_first_look_does_not_move_if_all_replays_blow_up():
 def test_a_first_look_begins_at_the_best_of_its_starts():
     """Steps of at most two units do not reach the optimum from the first start; the second is close to it."""
     space, slopes = Space((line("a"),)), np.ones((1, 1))
-    far, _ = first_look(linear(slopes, [40.0]), space, [[0.0]], slopes, RefineConfig(chords=3))
+    far, _ = first_look(linear(slopes, [40.0]), space, [[0.0]], slopes, RefineConfig())
     assert 0.0 < far[0] < 10.0
     values, objective = first_look(linear(slopes, [40.0]), space, [[0.0], [39.0]], slopes)
     assert values[0] == pytest.approx(40.0 / (1 + 1 / 16), abs=0.01)  # the prior is four deviations wide
@@ -429,7 +429,7 @@ def test_first_looks_share_batches_and_end_as_if_they_were_separate():
         Look(Space((line(name),)), np.array([[0.0], [1.0]]), slopes[:, [k]], partial(with_zero, k))
         for k, name in enumerate("ab")
     ]
-    config = RefineConfig(chords=3)
+    config = RefineConfig()
     together, batches = chords(recorder, looks, config), [len(rows) for rows in recorder.asked]
     each = 2 * RefineConfig().trials  # of a look of two starts
     assert batches == [4, 2 * each, each, each]
@@ -596,15 +596,24 @@ def test_short_steps_correct_the_slopes_more_than_long_ones():
 
 
 def test_corrected_slopes_save_replays():
-    """A chain of Rosenbrock's valleys: 1,137 replays with corrections, 2,289 without."""
-    space = Space(tuple(line(name) for name in "abcdefgh"))
+    """A chain of Rosenbrock's valleys in 20 parameters, whose differences take more replays than candidate steps."""
+    space = Space(tuple(line(f"v{k}") for k in range(20)))
 
     def chain(x: np.ndarray) -> np.ndarray:
         return np.concatenate([10.0 * (x[:, 1:] - x[:, :-1] ** 2), 1.0 - x[:, :-1]], axis=1)
 
     counts = {}
     for ridge in (1e-2, None):
-        fit = refine(chain, space, np.zeros(8), dataclasses.replace(FLAT, secant_ridge=ridge, iterations=60))
+        fit = refine(chain, space, np.zeros(20), dataclasses.replace(FLAT, secant_ridge=ridge, iterations=90))
         np.testing.assert_allclose(fit.best, 1.0, atol=1e-4)
         counts[ridge] = fit.evaluations
     assert counts[1e-2] < 0.7 * counts[None], counts
+
+
+def test_where_differences_are_cheap_they_are_taken_anew():
+    """Two parameters: four replays of differences, 32 of candidate steps."""
+    counts = [
+        refine(two_basins, BASINS, [3.2, 14.0], dataclasses.replace(FLAT, secant_ridge=ridge)).evaluations
+        for ridge in (1e-2, None)
+    ]
+    assert counts[0] == counts[1]
