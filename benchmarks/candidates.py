@@ -29,7 +29,6 @@ from droid_jax.discrepancy.config import DiscrepancyConfig  # noqa: E402
 from droid_jax.door.demonstration import demonstration_path  # noqa: E402
 from droid_jax.door.scene import door_scene  # noqa: E402
 from droid_jax.door.space import door_nuisances, door_space  # noqa: E402
-from droid_jax.identify.levenberg_marquardt import LevenbergMarquardtConfig  # noqa: E402
 from droid_jax.model.effects.candidate import candidates  # noqa: E402
 from droid_jax.model.effects.registry import effect_space, library, ready  # noqa: E402
 from droid_jax.recordings.formats import load_recording  # noqa: E402
@@ -79,8 +78,7 @@ def main() -> None:
     asked, config = candidates(effects), DiscrepancyConfig()
     questions = directions_of(asked)
     row = usual["full"] / arguments.rows
-    usual_steps = LevenbergMarquardtConfig()
-    steps = usual_steps.chords * usual_steps.trials  # of an iteration, where every batch along one Jacobian pays
+    steps = config.refit.corrected_batches * config.refit.trials  # of an iteration, if it takes all batches
     look_rows = 2 * (1 + config.one_step.chords * config.one_step.trials)  # from two starts, whose Jacobian is known
     refit_rows = 2 * (len(base) + 2) + steps
     result = {

@@ -183,8 +183,8 @@ def _forward(problem: Problem, model: FittedModel, found: ScoreTest) -> tuple[Se
     best = sorted([*sure, *others], key=lambda fit: fit[1])[: config.full_refits]
     begun = SelectionStep(found, model.keys, tuple(ranked), nearest=tuple(p for _, _, p in best))
     starts = [((*model.parts, *p.parts), values) for values, _, p in best]
-    certain = {id(p) for _, _, p in sure}
-    reached = [-np.inf if id(p) in certain else objective for _, objective, p in best]
+    certain = {p.keys for _, _, p in sure}
+    reached = [-np.inf if p.keys in certain else objective for _, objective, p in best]
     target, before = target_objective(problem, model), model.refined.objective
     tried, more = staged_refit(problem, starts, target, "candidates not refitted", one_step=(before, reached))
     notes += more

@@ -1,11 +1,11 @@
 """Levenberg-Marquardt in batches: one iteration of several starts at once, in search coordinates.
 
 An iteration is one batch of central differences, then batches of candidate steps, as long as they lower the objective
-enough.  Each batch corrects the Jacobian with the replays of its candidate steps (`secant_slopes`).  Candidate steps
-differ in their damping, their length and their path.  The path is straight in search coordinates or in physical units.
-Residuals are close to linear in masses, springs and damping, whose search coordinates are logarithms.  Where two of
-these are correlated (door and knob turn about the same hinge), the valley of the objective is straight in physical
-units only.
+enough.  If differences take more replays than a batch of candidate steps, each batch corrects the Jacobian with its
+replays (`secant_slopes`); else new differences are as cheap.  Candidate steps differ in their damping, their length and
+their path.  The path is straight in search coordinates or in physical units.  Residuals are close to linear in masses,
+springs and damping, whose search coordinates are logarithms.  Where two of these are correlated (door and knob turn
+about the same hinge), the valley of the objective is straight in physical units only.
 """
 
 from __future__ import annotations
@@ -38,8 +38,7 @@ class LevenbergMarquardtConfig:
     chord: where a Jacobian is not corrected, share of the objective by which a batch of candidate steps must lower it
       for another batch.
     chords: largest number of batches with one uncorrected Jacobian.
-    corrected_batches: largest number of batches with a Jacobian that each of them corrects.  This is done where
-      differences take more replays than a batch of candidate steps; else new differences are as cheap.
+    corrected_batches: largest number of batches with a Jacobian that each of them corrects.
     secant_ridge: ridge of the correction of a Jacobian, which limits the effect of two nearly parallel steps; None: no
       correction, and `chord` decides about another batch.
     dampings: factors on the last damping in a batch of candidate steps.  With `lengths` and both paths these are 32
@@ -293,7 +292,7 @@ class DampedProblem:
     def candidate_steps(
         self, state: Starts, jacobian: np.ndarray, held: np.ndarray | None = None
     ) -> tuple[Starts, np.ndarray]:
-        """Take batches of candidate steps from a Jacobian [S, M, D]; return the starts and their corrected Jacobian.
+        """Take batches of candidate steps; return the starts, and the Jacobian [S, M, D] with its corrections.
 
         A start gets another batch if the last one decreased its objective enough.  The decrease for each replay must be
         that of the first batch, whose replays include the differences.  Without corrections see `paid`.

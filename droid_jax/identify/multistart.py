@@ -357,15 +357,15 @@ class _Descent(DampedProblem):
             least = self.least_decrease(state)
             failed = 0 if decrease[best] > max(least, coarse * state.objective[best]) else failed + 1
             failed_finely = 0 if decrease[best] > least else failed_finely + 1
-            # A start that did not move at all may yet, with wider differences.
-            self.ended = failed_finely >= self.config.patience and bool(decrease[best] > 0)
+            moved = bool(decrease[best] > 0)  # one that did not may yet, with wider differences
+            self.ended = moved and failed_finely >= self.config.patience
             if failed == (1 if coarse else self.config.patience):
                 break
             self.given_up = bool(
                 self.config.give_up * decrease[best] < state.objective[best] - self.config.target_objective
             )
             if self.given_up:
-                self.ended = bool(decrease[best] > 0)
+                self.ended = moved
                 break
             good = state.objective <= ratios[min(number, len(ratios) - 1)] * state.objective[best]
             if number >= SORTED:

@@ -1,9 +1,9 @@
-"""A scene with some other numbers: what one recording states of its own set-up in place of the MJCF's.
+"""Variants of a scene: numbers of the MJCF that are different for one recording.
 
-A variant has the same bodies, joints, geoms and actuators, and other numbers: another mounting of the base, a payload
-that was weighed.  What a recording holds of it is the numbers that differ, by field of MjModel and name of the element,
-{"body_mass": {"payload": [0.5]}}; what the compiler derives from them is derived again.  Parameters act on the
-variant's numbers.  Each variant is a scene of its own: MJX compiles its replays once more, plain C nothing.
+A variant has the same bodies, joints, geoms and actuators as the scene.  Some of its numbers differ: the pose of the
+base, the mass of a payload.  The recording holds these numbers by field of MjModel and name of the element,
+{"body_mass": {"payload": [0.5]}}.  Numbers that MuJoCo's compiler derives from them are derived again.  Parameters act
+on the variant's numbers.  Each variant is a scene: MJX compiles its replays once more, plain C compiles nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _SPARED = (
     "dof_length",
 )
 _DERIVED = (*(set(DERIVED) - {"eq_data"}), *_SPARED, "actuator_acc0", "actuator_length0")
-TOLD = 4  # numbers that a sentence names
+NAMED = 4  # numbers that a message names
 _CLOSE = 1e-6  # relative, of numbers that were derived twice
 
 
@@ -189,9 +189,10 @@ def _numbers(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def numbers_that_differ(scene: Scene, variant: Scene) -> dict[str, dict[str, list[float]]]:
-    """What a recording of `variant` has to state where fits are made with `scene`.
+    """Return the numbers that a recording of `variant` states if `scene` is fitted.
 
-    Raises ValueError where they differ in anything else: in names, in what is attached to what, in options.
+    Raises:
+        ValueError: they differ in anything else: in names, in the tree, in options.
     """
     one, other = scene.model, variant.model
     for kind in dict.fromkeys(kind for kind, _ in _KINDS.values()):
@@ -213,17 +214,17 @@ def numbers_that_differ(scene: Scene, variant: Scene) -> dict[str, dict[str, lis
                 found.setdefault(field, {})[name] = there[rows].ravel().tolist()
     if not np.array_equal(one.opt.gravity, other.opt.gravity):
         found[OPTION] = {GRAVITY: other.opt.gravity.tolist()}
-    left = list(_left(variant_scene(scene, found).model, other))
-    if left:
+    further = list(_further_differences(variant_scene(scene, found).model, other))
+    if further:
         raise ValueError(
-            f"{variant.name!r} differs from {scene.name!r} in {', '.join(left)}, which a recording cannot state: give "
-            "both files the same"
+            f"{variant.name!r} differs from {scene.name!r} in {', '.join(further)}, which a recording cannot state: "
+            "give both files the same"
         )
     return found
 
 
-def _left(one: mujoco.MjModel, other: mujoco.MjModel) -> Iterator[str]:
-    """What of two models differs that a replay reads, in words."""
+def _further_differences(one: mujoco.MjModel, other: mujoco.MjModel) -> Iterator[str]:
+    """Differences of two models that a replay reads, in words."""
     for name in (n for n in dir(one.opt) if not n.startswith("_")):
         here, there = getattr(one.opt, name), getattr(other.opt, name)
         if name == "disableflags":  # a model whose geoms were moved goes without boxes around them
@@ -282,10 +283,10 @@ def _relative(write: Write) -> bool:
 
 
 def variant_text(numbers: Numbers) -> str:
-    """What a recording states, for people."""
+    """The numbers that a recording states, in words."""
     each = [
         f"{name if field == OPTION else f'{field} of {name}'} {' '.join(f'{v:.4g}' for v in value)}"
         for field, name, value in _stated(json.dumps(lists_of_numbers(numbers)))
     ]
-    more = f" and {len(each) - TOLD} more" if len(each) > TOLD else ""
-    return ", ".join(each[:TOLD]) + more
+    more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""
+    return ", ".join(each[:NAMED]) + more

@@ -31,7 +31,7 @@ def stages(names: Sequence[str], most: Mapping[str, int] | None = None) -> Itera
     Args:
         names: of the stages.
         most: for stages that report a text at the beginning of each step, the largest number of steps; the remaining
-            time is that of so many.  A stage that comes again after another one counts its steps anew.
+            time is that of so many.  A stage that comes again after another one counts its steps from zero.
     """
     line = Steps(most or {}).line
     if not Console().is_terminal:

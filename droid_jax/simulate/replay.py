@@ -197,7 +197,7 @@ def servo_motion(
     """The loop over time steps that follows a command, before the sensor model.
 
     A torque has the time of the state on which it acts.  The state is position, velocity, the solver's warm start and
-    the loads.  Everything else in mjx.Data is computed anew in each step, so that XLA removes what is not used.
+    the loads.  Everything else in mjx.Data is computed again in each step, so that XLA removes what is not used.
 
     Args:
         scene: what is simulated.

@@ -46,8 +46,8 @@ def test_a_limit_of_iterations_tells_the_most_time_left(capsys: pytest.CaptureFi
 def test_stages_and_training_write_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture) -> None:
     with progress.stages(["refine"]) as report:
         report("refine", SimpleNamespace(iteration=1, iterations=30, mean_square=2.0))
-    with progress.training(100) as told:
-        told(SimpleNamespace(step=100, reward=3.0, success=0.5, rate=1000.0, remaining=0.0))
+    with progress.training(100) as show:
+        show(SimpleNamespace(step=100, reward=3.0, success=0.5, rate=1000.0, remaining=0.0))
     refine, compiling, done = capsys.readouterr().out.splitlines()
     assert refine.startswith("refine 1/30 mean square 2 (noise: 1) (0 s")
     assert compiling == "training 0/100 compiling, a minute (0 s)"
