@@ -1,12 +1,13 @@
 """A single commanded log: how often is there a false alarm, and how often is a hidden effect named?
 
-    python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--out DIR] [--runs DIR]
+    python benchmarks/lone_logs.py [--quick] [--null 50] [--blind 60] [--so101 FILE] [--out DIR] [--runs DIR]
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
 its torques too, searched in windows of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
 Hidden effects are 3 and 10 times their minimum effect size.  They are effects of the library, or errors of a set-up
-(`--hidden setup`).  One JSON file per case is written under RUNS.  A stopped run can be continued, and several
-processes can share the cases.
+(`--hidden setup`).  FILE adds a third robot with nothing hidden, in positions: an SO-101 arm, whose MJCF is not part of
+this repository, with the parameters of experiments/so101.json.  One JSON file per case is written under RUNS.  A
+stopped run can be continued, and several processes can share the cases.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ from droid_jax.model.effect_interface import Effect  # noqa: E402
 from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
 from droid_jax.model.effects.registry import ready  # noqa: E402
 from droid_jax.model.fields import body_mass, joint_damping, servo_scale, time_offset  # noqa: E402
+from droid_jax.model.parameter_file import friction_joints, load_parameters  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
-from droid_jax.model.scene import Scene, compile_scene  # noqa: E402
+from droid_jax.model.scene import Scene, compile_scene, load_scene  # noqa: E402
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide  # noqa: E402
 from droid_jax.recordings.split import Split, roles_of  # noqa: E402
 from droid_jax.simulate.c_engine import simulate  # noqa: E402
@@ -79,8 +81,13 @@ ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <actuator><position name="yaw" joint="yaw" kp="400"/><position name="shoulder" joint="shoulder" kp="900"/>
     <position name="elbow" joint="elbow" kp="400"/></actuator></mujoco>"""
 JOINTS = ("yaw", "shoulder", "elbow")
+SO101 = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 # rad, rad/s, rad: two sines a joint
-WAVES = (((0.7, 1.1, 0.0), (0.2, 2.9, 1.0)), ((0.5, 1.7, 0.3), (0.15, 3.7, 2.0)), ((0.6, 2.3, 1.0), (0.2, 0.9, 0.5)))
+WAVES = (
+    ((0.7, 1.1, 0.0), (0.2, 2.9, 1.0)), ((0.5, 1.7, 0.3), (0.15, 3.7, 2.0)), ((0.6, 2.3, 1.0), (0.2, 0.9, 0.5)),
+    ((0.5, 1.4, 0.7), (0.15, 3.3, 0.2)), ((0.7, 1.9, 0.1), (0.2, 4.1, 1.5)),
+    ((0.4, 1.2, 0.4), (0.1, 3.0, 0.8)),
+)  # fmt: skip
 HIDDEN = {
     "hinge": (
         "hinge_preload", "binding_spring", "over_centre", "magnetic_catch", "closer", "opening_check", "air_drag",
@@ -102,6 +109,7 @@ SETS = {"library": HIDDEN, "setup": SETUP}
 NAMES = {"library": "lone_logs", "setup": "setup_errors"}  # of the results
 CHANNELS = {"positions": ("position",), "torques": ("torque", "position")}
 COMBINATIONS = [(scene, channels) for scene in HIDDEN for channels in CHANNELS]
+OTHER = ("so101", "positions")  # with nothing hidden
 
 
 @dataclass(frozen=True)
@@ -118,6 +126,8 @@ class Arguments:
     """What is hidden: effects of the library in general, or errors of the set-up, whose result is setup_errors.json."""
     only: str = ""
     """Run only cases whose name begins with this text."""
+    so101: Path | None = None
+    """MJCF of an SO-101 arm, for as many cases with nothing hidden as the others have each."""
     windows: float = 0.0
     """Length of the windows, s, each replayed from its measured state; 0: whole motions are replayed."""
     minutes: float = 0.0
@@ -155,15 +165,20 @@ class Plan:
     factor: float = 0.0
 
 
-def bench(scene: str, channels: str) -> Bench:
-    """Of a scene and a set of channels."""
+def bench(scene: str, channels: str, so101: Path | None = None) -> Bench:
+    """Of a scene and a set of channels; `so101` is the MJCF of that scene."""
     compared, clock = CHANNELS[channels], np.arange(0.0, HELD + SECONDS, 0.004)
     if scene == "hinge":
         where = setting("hinge")
         model, base, joints, command = where.scene, where.base, (DOOR,), _strokes(clock - HELD)[:, None]
-    else:
+    elif scene == "arm":
         model = ready(compile_scene(mujoco.MjSpec.from_string(ARM), "arm", joints=JOINTS))
-        base, joints, command = _arm_base(model), JOINTS, _waves(np.maximum(clock - HELD, 0.0))
+        base, joints, command = _arm_base(model), JOINTS, _waves(np.maximum(clock - HELD, 0.0), JOINTS)
+    else:
+        assert so101 is not None  # its cases are planned only then
+        file = ROOT / "experiments" / "so101.json"
+        model = ready(load_scene(so101, joints=SO101, friction_joints=friction_joints(file), hold=True))
+        base, joints, command = load_parameters(file, model), SO101, _waves(np.maximum(clock - HELD, 0.0), SO101)
     if "torque" not in compared:
         base = Space(tuple(p for p in base.parameters if not p.name.startswith("torque_offset")))
     start = dict(zip(joints, command[0].tolist(), strict=True))
@@ -189,15 +204,16 @@ def _strokes(clock: np.ndarray) -> np.ndarray:
     return angle
 
 
-def _waves(clock: np.ndarray) -> np.ndarray:
-    swings = [sum(size * np.sin(w * clock + phase) for size, w, phase in waves) for waves in WAVES]
+def _waves(clock: np.ndarray, joints: Sequence[str]) -> np.ndarray:
+    swings = [sum(size * np.sin(w * clock + phase) for size, w, phase in waves) for waves in WAVES[: len(joints)]]
     return minimum_jerk(clock / 1.5)[:, None] * np.stack(swings, axis=1)
 
 
 def plans(arguments: Arguments) -> list[Plan]:
     """All cases, ordered so that a stopped run has some of every kind."""
+    unchanged = [*COMBINATIONS, *([OTHER] if arguments.so101 else [])]
     null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
-            for n in range(1 if arguments.quick else arguments.null) for scene, channels in COMBINATIONS]  # fmt: skip
+            for n in range(1 if arguments.quick else arguments.null) for scene, channels in unchanged]  # fmt: skip
     hidden = list[Plan]()
     count, kinds = 1 if arguments.quick else arguments.blind, SETS[arguments.hidden]
     lists = {
@@ -353,7 +369,7 @@ def main(arguments: Arguments) -> None:
             if not mine or path.is_file():
                 continue
             key = plan.scene, plan.channels
-            benches.setdefault(key, bench(*key))
+            benches.setdefault(key, bench(*key, arguments.so101))
             seed = int(np.random.default_rng([arguments.seed, *plan.name.encode()]).integers(1 << 31))
             found = made(benches[key], plan, seed, arguments)
             write_json(path, found)
@@ -361,7 +377,7 @@ def main(arguments: Arguments) -> None:
                   f"p = {found.get('p')}, {found['seconds']:.0f} s {found.get('error', '')}", flush=True)  # fmt: skip
     cases = [json.loads(path.read_text()) for plan in wanted if (path := runs / f"{plan.name}.json").is_file()]
     groups = {f"{scene}, {channels}": [c for c in cases if (c["scene"], c["channels"]) == (scene, channels)]
-              for scene, channels in COMBINATIONS}  # fmt: skip
+              for scene, channels in (*COMBINATIONS, OTHER)}  # fmt: skip
     whole = summary(cases)
     result = {
         **whole,
