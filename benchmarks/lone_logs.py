@@ -68,6 +68,7 @@ from experiments.trials import answer_json  # noqa: E402
 SECONDS = 24.0
 HELD = 1.5  # s, before that: the robot settles where its servos hold it, and no log begins with a jolt
 NOISE = 1e-4  # rad, of a position sample
+SO101_NOISE = 4.4e-4  # rad, the deviation of rounding to its encoder's 4096 counts
 FACTORS = (3.0, 10.0)  # of the minimum effect size
 STROKES = ((3.0, 0.9), (5.0, 0.9), (4.6, 0.8), (3.4, 0.95), (2.6, 0.75), (5.4, 0.85))  # s and rad, there and back
 ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
@@ -240,7 +241,8 @@ def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | 
     rng, base = np.random.default_rng(seed), bench.base
     values = rng.normal(base.mean, np.where(base.nuisance, 1.0, 0.5) * base.std)
     truth = dict(zip(base.names, np.clip(values, base.low, base.high).tolist(), strict=True))
-    config = SyntheticRobotConfig(repeats=1, position_noise=NOISE)
+    noise = SO101_NOISE if plan.scene == OTHER[0] else NOISE
+    config = SyntheticRobotConfig(repeats=1, position_noise=noise)
     hidden = None
     if plan.effect:
         kind, _, joint = plan.effect.rstrip("]").partition("[")
@@ -389,7 +391,8 @@ def main(arguments: Arguments) -> None:
         "by_factor": {f"{f:g}": summary([c for c in cases if c["factor"] == f]) for f in FACTORS},
         "codes": sorted({str(c["code"]) for c in cases}),
         **({"false_names": whole["false_name_rate"]} if arguments.hidden == "setup" else {}),
-        "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "windows_s": arguments.windows},
+        "setting": {"seconds": SECONDS, "position_noise_rad": NOISE, "so101_noise_rad": SO101_NOISE,
+                    "windows_s": arguments.windows},
         "blind_cases": [{k: c.get(k) for k in ("name", "effect", "factor", "verdict", "effects", "indistinguishable",
                                                "named", "wrong", "p", "ranked")} for c in cases if c["effect"]],
     }  # fmt: skip
