@@ -125,7 +125,7 @@ def real_logs(name: str, data: Path, quick: bool) -> Logs:
 def door_logs() -> Logs:
     """Table I's door with one spring; the last repeats of demonstrations A and C are the test data."""
     scene = door_scene(timestep=doors.OURS)
-    fit, judge = zip(*(split_repeats(r, 0.3) for r in recordings(scene, synthetic_truth(scene, 1, 1), "AC", 1)),
+    fit, judge, _ = zip(*(split_repeats(r, 0.3) for r in recordings(scene, synthetic_truth(scene, 1, 1), "AC", 1)),
                      strict=True)  # fmt: skip
     asked = {"scene": DOOR, "channels": ["torque"], "refinement_only": False}
     return Logs(list(fit), list(judge), asked, {})
