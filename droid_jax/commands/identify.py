@@ -23,6 +23,7 @@ from droid_jax.commands.options import (
     needs_recording,
     needs_scene,
     own_scene,
+    quick_settings,
     recording_at,
     refine_config,
     search_config,
@@ -249,8 +250,9 @@ def identify_config(command: Identify) -> IdentifyConfig:
     from droid_jax.identify.pipeline import IdentifyConfig
 
     changes = {k: getattr(command, k) for k in ("population", "generations", "restarts")}
+    settings = {**quick_settings(command.preset), **({"generations_in_c": None} if command.generations else {})}
     return IdentifyConfig(
-        samples=64 if command.preset == "quick" else IdentifyConfig().samples,
+        **settings,
         engine=command.engine,
         search=search_config(command.preset, command.seed, **changes),
         refine=refine_config(command.preset),

@@ -65,6 +65,11 @@ def refine_config(preset: Preset) -> RefineConfig | None:
     return RefineConfig(basin_hop_generations=12) if preset == "quick" else RefineConfig()
 
 
+def quick_settings(preset: Preset) -> dict[str, int]:
+    """Further fields of IdentifyConfig of preset "quick"."""
+    return {"samples": 64, "generations_in_c": 5} if preset == "quick" else {}
+
+
 class OwnScene(Protocol):
     """The options that describe your own scene, and its recordings."""
 

@@ -59,13 +59,15 @@ class Notes:
 
     failed: names of models whose replay blew up.
     not_tried: candidates or fits that were skipped for lack of time, in words.
+    ruled_out: names of models that were not refitted, since after one step they were too far from the best ones.
     """
 
     failed: tuple[str, ...] = ()
     not_tried: tuple[str, ...] = ()
+    ruled_out: tuple[str, ...] = ()
 
     def __add__(self, other: Notes) -> Notes:
-        return Notes(self.failed + other.failed, self.not_tried + other.not_tried)
+        return Notes(*(getattr(self, name) + getattr(other, name) for name in Notes.__dataclass_fields__))
 
 
 def proposals_after_one_step(
@@ -119,20 +121,23 @@ def staged_refit(
             by the rule that gives up a refit (`RefineConfig.give_up`) is not refitted, unless it is the first.  None:
             all are refitted.
     """
-    models, failed, config = list[FittedModel](), list[str](), problem.case.config.refit
+    models, config = list[FittedModel](), problem.case.config.refit
+    failed, ruled_out = list[str](), list[str]()
     for number, (parts, start) in enumerate(starts):
         if number and problem.late:
-            return models, Notes(tuple(failed)) + _skipped(len(starts) - number, len(starts), what)
+            late = _skipped(len(starts) - number, len(starts), what)
+            return models, Notes(tuple(failed), ruled_out=tuple(ruled_out)) + late
         target = min([target, *(m.refined.objective for m in models)])
         if one_step is not None and models:
             before, reached = one_step[0], one_step[1][number]
             if config.give_up * (before - reached) < reached - target:
+                ruled_out.append(names_of(p.key for p in parts))
                 continue
         try:
             models.append(search_refit(problem, parts, start, replace(config, target_objective=target), note))
         except NotReplayed:
             failed.append(names_of(p.key for p in parts))
-    return models, Notes(tuple(failed))
+    return models, Notes(tuple(failed), ruled_out=tuple(ruled_out))
 
 
 def target_objective(problem: Problem, model: FittedModel) -> float:

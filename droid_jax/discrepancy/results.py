@@ -105,6 +105,7 @@ def gap_json(case: Case, verdict: Verdict) -> dict[str, Any]:
         "p": verdict.score_tests[0].p if verdict.score_tests else None,
         "discretisation_error": verdict.discretisation_error,
         "converged": verdict.base.refined.converged,
+        "ruled_out": list(verdict.ruled_out),
         "not_tried": "; ".join(verdict.not_tried),
         "remainder": verdict.remainder,
         "explained": verdict.explained if verdict.effects else None,

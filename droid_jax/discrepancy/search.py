@@ -104,6 +104,7 @@ def search_effects(
         if last_scored is not None and last_scored.keys == model.keys
         else _explained(problem, model),
         failed=notes.failed,
+        ruled_out=notes.ruled_out,
         not_tried=notes.not_tried,
     )
 

@@ -86,6 +86,7 @@ class Verdict:
         test recording, which then is not in `discrepancies`.
     indistinguishable_models: refitted models that are indistinguishable from `model`.
     experiments: experiments that would distinguish them, the best first.
+    ruled_out: names of models that were not refitted, since after one step they were too far from the best ones.
     not_tried: fits that were skipped for lack of time, in words.
     trend: the strongest trend over the repeats; None for logs, or if there was no score test.
     hints: effects that explain too little to be named (`unnamed`); the model does not have them.
@@ -108,6 +109,7 @@ class Verdict:
     failed: tuple[str, ...] = ()
     indistinguishable_models: tuple[FittedModel, ...] = ()
     experiments: tuple[Experiment, ...] = ()
+    ruled_out: tuple[str, ...] = ()
     not_tried: tuple[str, ...] = ()
     trend: Trend | None = None
     hints: tuple[Hint, ...] = ()
@@ -211,6 +213,7 @@ def conclude(
     *,
     exhausted: bool = False,
     failed: tuple[str, ...] = (),
+    ruled_out: tuple[str, ...] = (),
     not_tried: tuple[str, ...] = (),
 ) -> Verdict:
     """The verdict on a base model and a selected model.  If one of their fits did not converge, nothing is named.
@@ -223,6 +226,7 @@ def conclude(
         discretisation_error: U0.
         exhausted: whether the last score test found nothing more.
         failed: names of models whose replay blew up.
+        ruled_out: names of models that were not refitted at one place of the search or another (`Notes`).
         not_tried: fits that were skipped for lack of time.
     """
     config = case.config.selection
@@ -242,7 +246,7 @@ def conclude(
         before = discrepancies["validation"][0]
         if _remains(case, residuals, before, discretisation_error, exhausted):
             conclusion = Conclusion.PARTLY
-    first = steps[0].score_test if steps else None
+    first, tests = steps[0].score_test if steps else None, tuple(t for step in steps for t in step.tests)
     repeated = case.train.resampling.repeated
     verdict = Verdict(
         conclusion=conclusion,
@@ -254,12 +258,13 @@ def conclude(
         discrepancies=discrepancies,
         remainder=None if residuals is None else case.validation.resampling.discrepancy(residuals),
         score_tests=tuple(dict.fromkeys(step.score_test for step in steps)),  # pairs are proposed from the first one
-        validation_tests=tuple(t for step in steps for t in step.tests),
+        validation_tests=tests,
         before=localise(case.train, base.values, base.residuals, model.values),
         after=localise(case.train, model.values, model.residuals, model.values),
         config=config,
         failed=(*failed, *failed_on_test),
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
+        ruled_out=tuple(n for n in dict.fromkeys(ruled_out) if n not in {names_of(t.keys) for t in tests}),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
         doubts=(

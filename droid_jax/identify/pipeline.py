@@ -58,6 +58,8 @@ class IdentifyConfig:
         engine: "mjx", "mujoco" (plain C, all cores), or "auto": `simulate.engine.choose_engine` chooses.
         heldout: share of each recording's repeats that is held out (at least one of two).
         search: CMA-ES settings. It uses the first recording only, the refinement uses all of them.
+        generations_in_c: largest number of generations in plain C MuJoCo before a refinement.  There are no contact
+            pairs there, so few basins, and the refinement needs fewer replays.  None: `search.generations`.
         refine: refinement settings, or None: the search's covariance is the distribution, as in the paper.
         refine_in_c: settings of the refinement that are different in plain C MuJoCo.
         beginning: s of long recordings that the search and the first refinement use, and more until every command has
@@ -89,6 +91,7 @@ class IdentifyConfig:
     engine: str = "auto"
     heldout: float = 0.3
     search: CmaConfig = field(default_factory=CmaConfig)
+    generations_in_c: int | None = None
     refine: RefineConfig | None = field(default_factory=RefineConfig)
     refine_in_c: RefineInCConfig = field(default_factory=RefineInCConfig)
     beginning: float = 20.0
@@ -113,6 +116,7 @@ class IdentifyConfig:
             engine=partial(one_of, valid=CHOICES),
             heldout=partial(number, least=0, below=1),
             search=partial(instance, kind=CmaConfig),
+            generations_in_c=optional(partial(whole, least=1)),
             refine=optional(partial(instance, kind=RefineConfig)),
             refine_in_c=partial(instance, kind=RefineInCConfig),
             beginning=partial(number, above=0, infinite=True),
@@ -339,7 +343,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     found = cma_search(
         search_cost(first, first.comparisons[0].penalty, full, space),
         space,
-        config.search,
+        _search_settings(config, problem.engine.engine),
         checkpoint_dir=checkpoints,
         fingerprint=problem.fingerprint,
         progress=lambda p: report("search", p),
@@ -400,6 +404,14 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
         config=config,
         engine=problem.engine,
     )
+
+
+def _search_settings(config: IdentifyConfig, engine: str) -> CmaConfig:
+    """The search's settings for an engine."""
+    most = config.generations_in_c
+    if engine == "mjx" or config.refine is None or most is None:
+        return config.search
+    return replace(config.search, generations=min(config.search.generations, most))
 
 
 def _silent(stage: str, value: Any) -> None:

@@ -297,6 +297,7 @@ class Found(Answer, frozen=True, kw_only=True):
     channel: str = "torque"
     channels: list[str] = field(default_factory=lambda: ["torque"])
     distance_unit: str = ""
+    ruled_out: list[str] = field(default_factory=list[str])
     final_model: FinalModelEntry
     findings: list[FindingEntry] = field(default_factory=list)
     split: SplitEntry = SplitEntry()

@@ -218,12 +218,14 @@ def test_alternatives_experiments_and_skipped_fits_are_in_the_file(found: Small)
         indistinguishable=(((DRAG,), (DRAG, EffectKey("payload", "elbow"))),),
         experiments=(Experiment("open further", 7.5),),
         not_tried=("two candidates were not tried", "pairs of effects not tried"),
+        ruled_out=("closer at hinge",),
     )  # fmt: skip
     answer = gap_json(found.case, verdict)
     assert set(answer["about"]) == {"hinge_preload", "drag", "payload"}
     payload = {"effect": "payload", "location": "elbow"}
     assert answer["indistinguishable"] == [[[DRAG_ENTRY], [DRAG_ENTRY, payload]]]
     assert answer["not_tried"] == "; ".join(verdict.not_tried)
+    assert answer["ruled_out"] == ["closer at hinge"]
     assert answer["experiments"] == [{"what": "open further", "distance": 7.5, "not_made": ""}]
 
 

@@ -403,6 +403,7 @@ def test_no_name_of_a_search_becomes_markup(made: Callable, tmp_path: Path) -> N
         "about": {place["effect"]: {"what": evil, "signature": evil, "confused_with": [evil]}},
         "coefficients": [{**found["coefficients"][0], **place, "name": evil, "unit": evil, "what": evil}],
         "shifts": [{**found["shifts"][0], "name": evil, "unit": evil}], "not_tried": evil, "failed": [evil],
+        "ruled_out": [evil],
         "experiments": [{"what": evil, "distance": 9.0, "not_made": evil}],
         "trends": [{**found["trends"][0], **place, "coefficient": evil, "p": 0.001}],
         "score_tests": [{"p": 0.001, "ranking": [{**place, "t": 1.0, "explained": 0.5}], "failed": [place]}],
