@@ -94,7 +94,7 @@ class Identify:
     population: int | None = None
     """Samples per generation; default: the preset's."""
     generations: int | None = None
-    """Largest number of generations; default: the preset's."""
+    """Largest number of generations; default: the preset's (quick: 20, or 5 in plain C)."""
     restarts: int | None = None
     """Independent searches in one batch; default: the preset's."""
     nuisances: bool = True
