@@ -1,6 +1,6 @@
 """The SO-101 arm, by positions alone: fitted to two motions, tested on four others, with the program's commands.
 
-    python experiments/real_so101.py --data DIR [--gap]
+    python experiments/real_so101.py --data DIR [--gap | --bodies]
 
 `identify` fits `chirp_sweep` and `friction_gravity` of six STS3215 servos (`so101.json`: a gain, damping and dry
 friction of each of the first five joints, one armature that they share, and a delay), with the library's limit of the
@@ -15,6 +15,9 @@ MuJoCo's default friction creeps where the arm stands still; the fit uses hard f
 With --gap: what does a model of 24 parameters and a delay (gain, armature, damping and friction of each of the six
 joints) with MuJoCo's default friction lack?  `identify` fits it to the four motions and `gap` searches them from there;
 the two others are its test data.
+
+With --bodies: the fit with the inertia of four links as nuisances, once as ten numbers each that are a possible body at
+every value, once as mass, centre and principal moments that vary freely.  Draws of both Gaussians are checked.
 """
 
 from __future__ import annotations
@@ -25,15 +28,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import tyro
 from commanded_fit import HERE, command, evaluated, fitted, kept, parameters_of
 from inverse_fit import RESULTS, run
 
 from benchmarks import common
-from droid_jax.files import EXTENDED, GAP
+from droid_jax.files import EXTENDED, FULL_GAUSSIAN, GAP
 from droid_jax.identify.evaluation import evaluate_on
+from droid_jax.identify.gaussian import load_gaussian
 from droid_jax.model.parameter_file import friction_joints, load_parameters
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import load_scene
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
@@ -54,6 +60,10 @@ OF_A_JOINT: dict[str, dict[str, Any]] = {
     "damping": {"unit": "N m s/rad", "std": 0.6, "low": 0.01, "high": 10.0, "scaling": "log"},
     "frictionloss": {"unit": "N m", "std": 0.1, "low": 1e-6, "high": 2.0, "scaling": "log", "log_offset": 0.02},
 }
+LINKS = ("upper_arm", "lower_arm", "wrist", "gripper")
+LINK_STD = 0.2  # prior of each number of a link's inertia, share of the value
+CENTRE_STD = 0.01  # m
+DRAWS = 100
 DELAY = {"sensor": "time_offset", "std": 0.005, "high": 0.05}
 
 
@@ -62,6 +72,7 @@ class RealSo101:
     """Fit the SO-101 arm to positions of two motions, test it on four others.
 
     data: folder with the motions.
+    bodies: fit with the links' inertias, in place of the plain fit.
     gap: search what 24 parameters with MuJoCo's default friction lack, in place of the fit; half an hour or more.
     budget: minutes after which that search tries no further candidate; 0: none.
     quick: the first seconds of a motion to fit and of a test motion, and a short search; its numbers are not to be
@@ -73,6 +84,7 @@ class RealSo101:
 
     data: Path
     gap: bool = False
+    bodies: bool = False
     budget: float = 0.0
     quick: bool = False
     seconds: float = SECONDS
@@ -168,8 +180,76 @@ def searched(config: RealSo101) -> dict[str, Any]:
     }
 
 
+def parameters_with_links(path: Path, model: mujoco.MjModel, possible: bool) -> Path:
+    """The parameter file of the fit with the inertia of LINKS as nuisances, as possible bodies or freely."""
+    entries = json.loads((HERE / "so101.json").read_text())
+    shared: dict[str, Any] = {"nuisance": True, "group": "Inertia"}
+    for link in LINKS:
+        if possible:
+            entries.append({"inertia": link, "std": LINK_STD, **shared})
+            continue
+        of = model.body(link)
+        entries.append(_entry("body_mass", link, float(of.mass[0]), "kg"))
+        for axis in range(3):
+            centre = {"std": CENTRE_STD, "low": of.ipos[axis] - 0.1, "high": of.ipos[axis] + 0.1, "unit": "m"}
+            entries.append({"field": "body_ipos", "element": link, "column": axis, **centre, **shared})
+            entries.append(_entry("body_inertia", link, float(of.inertia[axis]), "kg m2", column=axis))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(entries, indent=1))
+    return path
+
+
+def _entry(field: str, link: str, value: float, unit: str, **column: int) -> dict[str, Any]:
+    """A number of a link that is positive."""
+    width = {"std": LINK_STD * value, "low": 0.1 * value, "high": 10.0 * value, "unit": unit, "scaling": "log"}
+    return {"field": field, "element": link, **column, **width, "nuisance": True, "group": "Inertia"}
+
+
+def possible_bodies(config: RealSo101, parameters: Path, fit: Path) -> int:
+    """Number of DRAWS of a fit's Gaussian whose links are possible bodies, in compiled models."""
+    scene, gaussian = load_scene(scene_of(config.data), joints=JUDGED), load_gaussian(fit / FULL_GAUSSIAN)
+    full = load_parameters(parameters, scene)
+    space = full.select(n for n in gaussian.space.names if n in full.names)
+    rows, possible = [scene.id("body", link) for link in LINKS], 0
+    for values in gaussian.sample(config.seed, DRAWS):
+        model = make_c_model(scene, space, values[gaussian.space.columns(space)])
+        moments = np.sort(model.body_inertia[rows], axis=1)
+        positive = (model.body_mass[rows] > 0) & (moments[:, 0] > 0)
+        possible += bool(np.all(positive & (moments[:, 2] <= moments[:, :2].sum(axis=1) * (1 + 1e-9))))
+    return possible
+
+
+def with_links(config: RealSo101) -> dict[str, Any]:
+    """Both fits with the links' inertias: errors of the first five joints, and draws that are possible bodies."""
+    seconds = 4.0 if config.quick else config.seconds
+    fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
+    runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
+    paths = kept([so101_log(config.data, motion, seconds) for motion in (*fit, *judges)], runs / "logs")
+    options = ["--joints", *JUDGED, "--effects", *EFFECTS, "--seed", str(config.seed)]
+    options += ["--generations", "3"] if config.quick else []
+    model, out = load_scene(scene_of(config.data)).model, dict[str, Any]()
+    for kind in ("possible_bodies", "free_entries"):
+        parameters = parameters_with_links(runs / f"so101_{kind}.json", model, kind == "possible_bodies")
+        given, test = ([paths[name] for name in names] for names in (fit, judges))
+        folder = runs / f"identify_{kind}"
+        found, took = fitted(scene_of(config.data), parameters, given, test, folder, options)
+        errors = evaluated(folder, [paths[name] for name in (*fit, *judges)], runs / f"evaluation_{kind}")["errors"]
+        mae = {name: _mrad(of["position"]["mae_after"]) for name, of in errors.items()}
+        of_links = [p for p in found["parameters"] if p["group"] == "Inertia"]
+        out[kind] = {
+            "mean_judged_mrad": round(float(np.mean([mae[name] for name in judges])), 3),
+            "mae_mrad": mae,
+            "draws": DRAWS,
+            "possible": possible_bodies(config, parameters, folder),
+            "numbers_of_links": len(of_links),
+            "not_identifiable": [p["name"] for p in of_links if not p["identifiable"]],
+            "seconds": round(took, 1),
+        }
+    return out
+
+
 def main(config: RealSo101) -> None:
-    """One fit tested on four motions, or one search; prints one line of JSON."""
+    """One fit tested on four motions, fits with the links' inertias, or one search; prints one line of JSON."""
     name = "real_so101_quick" if config.quick else "real_so101"
     path = config.out / f"{name}.json"
     known = json.loads(path.read_text()) if path.is_file() else {}
@@ -177,6 +257,11 @@ def main(config: RealSo101) -> None:
         known["gap"] = searched(config)
         write_json(path, known, indent=2)
         print(json.dumps({"gap": known["gap"]}))
+        return
+    if config.bodies:
+        known["links"] = {**common.origin(config.seed), **with_links(config)}
+        write_json(path, known, indent=2)
+        print(json.dumps({"links": known["links"]}))
         return
     seconds = 4.0 if config.quick else config.seconds
     fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
@@ -214,7 +299,7 @@ def main(config: RealSo101) -> None:
         "tied": [],
         "parameters": parameters_of(found),
         "seconds": round(took, 1),
-        **({"gap": known["gap"]} if "gap" in known else {}),
+        **{key: known[key] for key in ("gap", "links") if key in known},
     }
     common.publish(config.out, "real_so101", config.quick, config.seed, result)
 

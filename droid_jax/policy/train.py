@@ -46,7 +46,10 @@ class TrainConfig:
         envs: environments in parallel, over all devices.
         devices: number of devices; None: the most that divide `envs` and `batch`.
         hidden: sizes of the hidden layers of actor and critic.
-        learning_rate: of Adam.
+        learning_rate: of Adam; with `target_kl` the largest one.
+        target_kl: Kullback-Leibler divergence of an update from the policy that acted.  The learning rate is reduced
+            where it is more than twice as large, and raised again where it is less than half.  With a constant rate
+            some trainings on a fitted Gaussian lost a policy that opened nearly all doors.  None: a constant rate.
         discount: discount factor.
         gae: lambda of generalised advantage estimation.
         clip: clipping range of the probability ratio.
@@ -71,6 +74,7 @@ class TrainConfig:
     devices: int | None = None
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
+    target_kl: float | None = 0.01
     discount: float = 0.98
     gae: float = 0.95
     clip: float = 0.2
@@ -95,6 +99,7 @@ class TrainConfig:
             **dict.fromkeys(("discount", "gae"), partial(number, least=0, most=1)),
             devices=optional(partial(whole, least=1)),
             hidden=several(partial(whole, least=1)),
+            target_kl=optional(partial(number, above=0)),
             entropy=partial(number, least=0),
             enough=partial(number, above=0, most=1),
             held=partial(whole, least=0),
@@ -294,6 +299,7 @@ def _ppo(
         num_envs=config.envs,
         episode_length=env.task.steps,
         learning_rate=config.learning_rate,
+        **_schedule(config),
         entropy_cost=config.entropy,
         discounting=config.discount,
         unroll_length=config.unroll,
@@ -315,6 +321,17 @@ def _ppo(
         restore_params=restore,
         **hooks,
     )
+
+
+def _schedule(config: TrainConfig) -> dict[str, Any]:
+    """Arguments of brax's PPO for the learning rate's schedule."""
+    if config.target_kl is None:
+        return {}
+    return {
+        "learning_rate_schedule": "ADAPTIVE_KL",
+        "desired_kl": config.target_kl,
+        "learning_rate_schedule_max_lr": config.learning_rate,
+    }
 
 
 class _Ended(Exception):
