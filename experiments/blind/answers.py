@@ -201,8 +201,8 @@ def _at(scene: Scene, name: str, joint: str) -> str:
         name = ON_HINGE.get(name, name)
     if name in PLACES:
         return f"{name} at {PLACES[name]}"
-    if name == "payload":
-        return f"payload at {scene.joints[-1]}"
+    if name in ("payload", "free_payload"):
+        return f"{name} at {scene.joints[-1]}"
     if name in OF_HINGE:
         return f"{name} at {scene.object_joint}" if on_hinge else ""
     place = joint or scene.object_joint

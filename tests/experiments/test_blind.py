@@ -152,6 +152,9 @@ def test_places_of_answers():
     assert right(bench.scene, Applied("stribeck_friction", 1.0, "door")) == ("hinge_stribeck at door",)
     assert right(bench.scene, Applied("torque_bias", 1.0, "elbow")) == ("torque_bias at elbow", "cable_pull at elbow")
     assert right(bench.scene, Applied("detent", 1.0)) == ()
+    assert right(bench.scene, Applied("held_thing", 1.0)) == tuple(
+        f"{name} at {bench.scene.joints[-1]}" for name in ("free_payload", "payload")
+    )
     assert "elbow" not in targets(bench, "dry_friction")  # its friction is a base parameter
 
 
