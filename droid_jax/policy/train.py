@@ -48,8 +48,8 @@ class TrainConfig:
         hidden: sizes of the hidden layers of actor and critic.
         learning_rate: of Adam; with `target_kl` the largest one.
         target_kl: Kullback-Leibler divergence of an update from the policy that acted.  The learning rate is reduced
-            where it is more than twice as large, and raised again where it is less than half.  With a constant rate
-            some trainings on a fitted Gaussian lost a policy that opened nearly all doors.  None: a constant rate.
+            where it is more than twice as large, and raised again where it is less than half, so that a policy that
+            opens nearly all doors is not lost again.  None: a constant rate.
         discount: discount factor.
         gae: lambda of generalised advantage estimation.
         clip: clipping range of the probability ratio.
