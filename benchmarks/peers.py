@@ -54,8 +54,14 @@ HERE = ROOT / "experiments"
 STEP = 0.002  # s, of the fits of spring and arm
 JUDGING_GAIN = 400  # of the XL330
 SYNTHETIC, REAL = ("spring", "arm", "door"), ("go2", "xl330", "so101")
-BUDGET = {"population": 30, "generations": 20, "samples": 64, "cma_generations": 200, "iterations": 200}
-QUICK = {"population": 8, "generations": 2, "samples": 16, "cma_generations": 3, "iterations": 3}
+# The search of this program is that of `identify --preset quick`.
+BUDGET = {
+    "population": 30, "generations": 20, "generations_in_c": 5, "samples": 64, "cma_generations": 200,
+    "iterations": 200,
+}  # fmt: skip
+QUICK = {
+    "population": 8, "generations": 2, "generations_in_c": 2, "samples": 16, "cma_generations": 3, "iterations": 3,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

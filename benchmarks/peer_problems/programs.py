@@ -93,7 +93,9 @@ def ours(task: Problem) -> dict[str, Any]:
     search = CmaConfig(population=task.asked["population"], parents=None, generations=task.asked["generations"])
     found = identify_parameters(
         task.scene, task.space, task.fit, nuisances=task.nuisances,
-        config=IdentifyConfig(search=search, heldout=0.0, checks=False),
+        config=IdentifyConfig(
+            search=search, generations_in_c=task.asked["generations_in_c"], heldout=0.0, checks=False
+        ),
     )  # fmt: skip
     return {"values": found.best, "interval": found.full_gaussian.interval(LEVEL), "engine": found.engine.engine}
 
