@@ -212,7 +212,7 @@ def _waves(clock: np.ndarray, joints: Sequence[str]) -> np.ndarray:
 
 def plans(arguments: Arguments) -> list[Plan]:
     """All cases, ordered so that a stopped run has some of every kind."""
-    unchanged = [*COMBINATIONS, *([OTHER] if arguments.so101 else [])]
+    unchanged = [*COMBINATIONS, *([OTHER] if arguments.so101 or arguments.sum_only else [])]
     null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
             for n in range(1 if arguments.quick else arguments.null) for scene, channels in unchanged]  # fmt: skip
     hidden = list[Plan]()

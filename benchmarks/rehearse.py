@@ -32,7 +32,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, publish  # noqa: E402
 from benchmarks.sharing import claimed, kept  # noqa: E402
-from droid_jax.commands.options import refine_config, search_config  # noqa: E402
+from droid_jax.commands.options import quick_settings, refine_config, search_config  # noqa: E402
 from droid_jax.commands.rehearse import plain  # noqa: E402
 from droid_jax.discrepancy.candidates import observable_effects  # noqa: E402
 from droid_jax.discrepancy.config import CONVERGE_ITERATIONS, DiscrepancyConfig  # noqa: E402
@@ -140,7 +140,8 @@ def rehearsal_of(name: str, runs: Path, seed: int, full: bool) -> tuple[dict[str
     quick = kept(runs / f"quick_{name}_seed{seed}.json", made)
     if not full:
         return quick, where.scene, None
-    identify = IdentifyConfig(search=search_config("quick", seed), refine=refine_config("quick"), samples=0)
+    settings = {**quick_settings("quick"), "samples": 0}
+    identify = IdentifyConfig(search=search_config("quick", seed), refine=refine_config("quick"), **settings)
     found = rehearsed(where.scene, where.base, effects, recordings, plan, config, rehearsal, step_error=False)
     return (
         quick,

@@ -192,7 +192,8 @@ def parameters_with_links(path: Path, model: mujoco.MjModel, possible: bool) -> 
         entries.append(_entry("body_mass", link, float(of.mass[0]), "kg"))
         for axis in range(3):
             centre = {"std": CENTRE_STD, "low": of.ipos[axis] - 0.1, "high": of.ipos[axis] + 0.1, "unit": "m"}
-            entries.append({"field": "body_ipos", "element": link, "column": axis, **centre, **shared})
+            named = {"field": "body_ipos", "name": f"{link}_centre_{axis}", "element": link, "column": axis}
+            entries.append({**named, **centre, **shared})
             entries.append(_entry("body_inertia", link, float(of.inertia[axis]), "kg m2", column=axis))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(entries, indent=1))
@@ -202,7 +203,8 @@ def parameters_with_links(path: Path, model: mujoco.MjModel, possible: bool) -> 
 def _entry(field: str, link: str, value: float, unit: str, **column: int) -> dict[str, Any]:
     """A number of a link that is positive."""
     width = {"std": LINK_STD * value, "low": 0.1 * value, "high": 10.0 * value, "unit": unit, "scaling": "log"}
-    return {"field": field, "element": link, **column, **width, "nuisance": True, "group": "Inertia"}
+    name = "_".join([link, field, *map(str, column.values())])
+    return {"field": field, "name": name, "element": link, **column, **width, "nuisance": True, "group": "Inertia"}
 
 
 def possible_bodies(config: RealSo101, parameters: Path, fit: Path) -> int:
@@ -227,9 +229,14 @@ def with_links(config: RealSo101) -> dict[str, Any]:
     paths = kept([so101_log(config.data, motion, seconds) for motion in (*fit, *judges)], runs / "logs")
     options = ["--joints", *JUDGED, "--effects", *EFFECTS, "--seed", str(config.seed)]
     options += ["--generations", "3"] if config.quick else []
-    model, out = load_scene(scene_of(config.data)).model, dict[str, Any]()
-    for kind in ("possible_bodies", "free_entries"):
-        parameters = parameters_with_links(runs / f"so101_{kind}.json", model, kind == "possible_bodies")
+    scene, out = load_scene(scene_of(config.data), joints=JUDGED), dict[str, Any]()
+    files = {
+        kind: parameters_with_links(runs / f"so101_{kind}.json", scene.model, kind == "possible_bodies")
+        for kind in ("possible_bodies", "free_entries")
+    }
+    for parameters in files.values():
+        load_parameters(parameters, scene)  # both are valid, before anything takes long
+    for kind, parameters in files.items():
         given, test = ([paths[name] for name in names] for names in (fit, judges))
         folder = runs / f"identify_{kind}"
         found, took = fitted(scene_of(config.data), parameters, given, test, folder, options)
@@ -250,6 +257,8 @@ def with_links(config: RealSo101) -> dict[str, Any]:
 
 def main(config: RealSo101) -> None:
     """One fit tested on four motions, fits with the links' inertias, or one search; prints one line of JSON."""
+    if config.gap and config.bodies:
+        raise ValueError("--gap and --bodies are two experiments: give one of them")
     name = "real_so101_quick" if config.quick else "real_so101"
     path = config.out / f"{name}.json"
     known = json.loads(path.read_text()) if path.is_file() else {}

@@ -267,15 +267,19 @@ def test_the_documented_effect_is_one(monkeypatch: pytest.MonkeyPatch):
 def test_the_presets_are_those_of_the_command_line():
     """The table in docs/method.md, row by row."""
     rows = re.findall(
-        r"^\| (quick|standard|paper|gpu) \| (\d+) \| (\d+) \| (\d+) \| (\d+) \| (\d) ms \| (yes|no) \|$",
+        r"^\| (quick|standard|paper|gpu) \| (\d+) \| (\d+) \| (\d+)(?:, in plain C (\d+))? \| (\d+) \| (\d) ms "
+        r"\| (yes|no) \|$",
         (ROOT / "docs" / "method.md").read_text(),
         re.MULTILINE,
     )
     assert [r[0] for r in rows] == ["quick", "standard", "paper", "gpu"]
-    for preset, *numbers, step, refined in rows:
+    for preset, population, elite, generations, in_c, restarts, step, refined in rows:
         command = Identify(preset=preset)
         config, search = identify_config(command), identify_config(command).search
-        assert [search.population, search.elite, search.generations, search.restarts] == [int(n) for n in numbers]
+        numbers = [int(n) for n in (population, elite, generations, restarts)]
+        assert [search.population, search.elite, search.generations, search.restarts] == numbers
+        assert config.generations_in_c == (int(in_c) if in_c else None)
+        assert identify_config(Identify(preset=preset, generations=7)).generations_in_c is None
         assert (config.refine is not None) == (refined == "yes")
         scene, _, nuisances = identify_model(command)
         assert scene.model.opt.timestep == pytest.approx(int(step) / 1000)

@@ -94,7 +94,7 @@ def ours(task: Problem) -> dict[str, Any]:
     found = identify_parameters(
         task.scene, task.space, task.fit, nuisances=task.nuisances,
         config=IdentifyConfig(
-            search=search, generations_in_c=task.asked["generations_in_c"], heldout=0.0, checks=False
+            search=search, generations_in_c=task.asked.get("generations_in_c"), heldout=0.0, checks=False
         ),
     )  # fmt: skip
     return {"values": found.best, "interval": found.full_gaussian.interval(LEVEL), "engine": found.engine.engine}

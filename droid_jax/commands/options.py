@@ -65,7 +65,7 @@ def refine_config(preset: Preset) -> RefineConfig | None:
     return RefineConfig(basin_hop_generations=12) if preset == "quick" else RefineConfig()
 
 
-def quick_settings(preset: Preset) -> dict[str, int]:
+def quick_settings(preset: Preset) -> dict[str, Any]:
     """Further fields of IdentifyConfig of preset "quick"."""
     return {"samples": 64, "generations_in_c": 5} if preset == "quick" else {}
 

@@ -18,6 +18,7 @@ from droid_jax.commands.options import (
     load_effects,
     needs_recording,
     needs_scene,
+    quick_settings,
     recording_at,
     refine_config,
     search_config,
@@ -206,7 +207,9 @@ def _full(
     if not all(r.command.size for r in recordings):
         raise ValueError("--full needs recordings with commands: without them the motion cannot be simulated")
     identify = IdentifyConfig(
-        search=search_config(command.preset, command.seed), refine=refine_config(command.preset), samples=0
+        search=search_config(command.preset, command.seed),
+        refine=refine_config(command.preset),
+        **{**quick_settings(command.preset), "samples": 0},
     )
     of = FullRehearsal(
         scene, base, tuple(effects), tuple(recordings), plan, config, identify, rehearsal, found,

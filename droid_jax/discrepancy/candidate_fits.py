@@ -16,7 +16,7 @@ from droid_jax.distributed import agreed
 from droid_jax.identify.multistart import RefineConfig
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed
-from droid_jax.model.effects.candidate import Candidate, names_of
+from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 
 ONE_STEP_BATCH = 6  # candidates whose one-step fits share batches: few of them do not fill a block of a CPU
 Start = tuple[Sequence[Candidate], np.ndarray]  # effects, and values [D] to start from
@@ -59,12 +59,12 @@ class Notes:
 
     failed: names of models whose replay blew up.
     not_tried: candidates or fits that were skipped for lack of time, in words.
-    ruled_out: names of models that were not refitted, since after one step they were too far from the best ones.
+    ruled_out: effects of models that were not refitted, since after one step they were too far from the best ones.
     """
 
     failed: tuple[str, ...] = ()
     not_tried: tuple[str, ...] = ()
-    ruled_out: tuple[str, ...] = ()
+    ruled_out: tuple[Keys, ...] = ()
 
     def __add__(self, other: Notes) -> Notes:
         return Notes(*(getattr(self, name) + getattr(other, name) for name in Notes.__dataclass_fields__))
@@ -122,7 +122,7 @@ def staged_refit(
             all are refitted.
     """
     models, config = list[FittedModel](), problem.case.config.refit
-    failed, ruled_out = list[str](), list[str]()
+    failed, ruled_out = list[str](), list[Keys]()
     for number, (parts, start) in enumerate(starts):
         if number and problem.late:
             late = _skipped(len(starts) - number, len(starts), what)
@@ -131,7 +131,7 @@ def staged_refit(
         if one_step is not None and models:
             before, reached = one_step[0], one_step[1][number]
             if config.give_up * (before - reached) < reached - target:
-                ruled_out.append(names_of(p.key for p in parts))
+                ruled_out.append(keys_of(parts))
                 continue
         try:
             models.append(search_refit(problem, parts, start, replace(config, target_objective=target), note))

@@ -213,7 +213,7 @@ def conclude(
     *,
     exhausted: bool = False,
     failed: tuple[str, ...] = (),
-    ruled_out: tuple[str, ...] = (),
+    ruled_out: tuple[Keys, ...] = (),
     not_tried: tuple[str, ...] = (),
 ) -> Verdict:
     """The verdict on a base model and a selected model.  If one of their fits did not converge, nothing is named.
@@ -226,7 +226,7 @@ def conclude(
         discretisation_error: U0.
         exhausted: whether the last score test found nothing more.
         failed: names of models whose replay blew up.
-        ruled_out: names of models that were not refitted at one place of the search or another (`Notes`).
+        ruled_out: effects of models that one step of the search ruled out (`Notes`).
         not_tried: fits that were skipped for lack of time.
     """
     config = case.config.selection
@@ -264,7 +264,7 @@ def conclude(
         config=config,
         failed=(*failed, *failed_on_test),
         indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
-        ruled_out=tuple(n for n in dict.fromkeys(ruled_out) if n not in {names_of(t.keys) for t in tests}),
+        ruled_out=_not_refitted(ruled_out, tests, failed),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
         doubts=(
@@ -273,6 +273,13 @@ def conclude(
         ),
     )
     return unnamed(case, verdict) if closes_too_little(verdict) else verdict
+
+
+def _not_refitted(ruled_out: Sequence[Keys], tests: Sequence[ValidationTest], failed: Sequence[str]) -> tuple[str, ...]:
+    """Names of models that were ruled out by one step and not refitted later, in this order of effects or another."""
+    refitted = {frozenset(test.keys) for test in tests}
+    names = dict.fromkeys(names_of(keys) for keys in ruled_out if frozenset(keys) not in refitted)
+    return tuple(name for name in names if name not in failed)
 
 
 def closes_too_little(verdict: Verdict) -> bool:

@@ -58,8 +58,8 @@ class IdentifyConfig:
         engine: "mjx", "mujoco" (plain C, all cores), or "auto": `simulate.engine.choose_engine` chooses.
         heldout: share of each recording's repeats that is held out (at least one of two).
         search: CMA-ES settings. It uses the first recording only, the refinement uses all of them.
-        generations_in_c: largest number of generations in plain C MuJoCo before a refinement.  There are no contact
-            pairs there, so few basins, and the refinement needs fewer replays.  None: `search.generations`.
+        generations_in_c: largest number of generations before a refinement in plain C MuJoCo, of a scene without
+            contact pairs.  It has few basins, and the refinement needs fewer replays.  None: `search.generations`.
         refine: refinement settings, or None: the search's covariance is the distribution, as in the paper.
         refine_in_c: settings of the refinement that are different in plain C MuJoCo.
         beginning: s of long recordings that the search and the first refinement use, and more until every command has
@@ -343,7 +343,7 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     found = cma_search(
         search_cost(first, first.comparisons[0].penalty, full, space),
         space,
-        _search_settings(config, problem.engine.engine),
+        _search_settings(config, problem.engine.engine, problem.scene),
         checkpoint_dir=checkpoints,
         fingerprint=problem.fingerprint,
         progress=lambda p: report("search", p),
@@ -406,10 +406,10 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
     )
 
 
-def _search_settings(config: IdentifyConfig, engine: str) -> CmaConfig:
-    """The search's settings for an engine."""
-    most = config.generations_in_c
-    if engine == "mjx" or config.refine is None or most is None:
+def _search_settings(config: IdentifyConfig, engine: str, scene: Scene) -> CmaConfig:
+    """The search's settings for an engine and a scene."""
+    most, contacts = config.generations_in_c, scene.grip is not None or scene.model.npair > 0
+    if engine == "mjx" or contacts or config.refine is None or most is None:
         return config.search
     return replace(config.search, generations=min(config.search.generations, most))
 

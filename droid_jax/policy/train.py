@@ -112,6 +112,7 @@ class TrainConfig:
             )
 
 
+SMALLEST_RATE = 1e-5  # brax's own, of the schedule of `TrainConfig.target_kl`
 PRESETS = {
     "quick": TrainConfig(),
     "paper": TrainConfig(steps=20_000_000, batch=64, evaluations=40, eval_envs=128),
@@ -180,7 +181,7 @@ def train(
         randomise: draws the physics of the environments; None: all have those of `env`.
         config: settings of PPO.
         checkpoints: folder for the networks after each evaluation; an interrupted training continues from it, with the
-            same draws of the physics, but with new moments of Adam and new starts.
+            same draws of the physics, but with new moments of Adam, the largest learning rate and new starts.
         fingerprint: further properties that must agree with those of a checkpoint.
         progress: is called after each evaluation.
 
@@ -331,6 +332,7 @@ def _schedule(config: TrainConfig) -> dict[str, Any]:
         "learning_rate_schedule": "ADAPTIVE_KL",
         "desired_kl": config.target_kl,
         "learning_rate_schedule_max_lr": config.learning_rate,
+        "learning_rate_schedule_min_lr": min(SMALLEST_RATE, config.learning_rate),
     }
 
 

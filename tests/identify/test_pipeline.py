@@ -374,3 +374,24 @@ def test_a_search_imports_no_optional_modules():
     code = f"import sys, droid_jax.identify.search, droid_jax.identify.gaussian; {seen}"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert run.stdout.splitlines()[-1] == "False False", run.stderr
+
+
+@pytest.mark.parametrize(
+    ("engine", "contacts", "refined", "most", "generations"),
+    [
+        ("mujoco", False, True, 5, 5),
+        ("mujoco", False, True, 50, 20),
+        ("mujoco", False, True, None, 20),
+        ("mujoco", False, False, 5, 20),
+        ("mujoco", True, True, 5, 20),
+        ("mjx", False, True, 5, 20),
+    ],
+)
+def test_the_search_in_plain_c_is_short_before_a_refinement(
+    engine: str, contacts: bool, refined: bool, most: int | None, generations: int
+):
+    config = IdentifyConfig(
+        search=CmaConfig(generations=20), generations_in_c=most, refine=RefineConfig() if refined else None
+    )
+    scene = door_scene() if contacts else elbow()
+    assert pipeline._search_settings(config, engine, scene).generations == generations

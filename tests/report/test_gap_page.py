@@ -119,6 +119,9 @@ def test_settings_and_times_are_on_the_page(made: Callable) -> None:
         assert f"{stage.replace('_', ' ')} {significant(seconds)} s" in facts
     assert "11 in the score test of the base model, 4 models validated" in facts
     assert "preset quick; fit a.npz; validation b.npz; recording a.npz" in facts
+    assert "Not refitted" not in facts
+    _, written = made(ruled_out=["drag at door hinge"])
+    assert "drag at door hinge: too far from the best ones" in spaced(written.ids["gap-facts"]["text"])
 
 
 def test_settings_are_those_that_a_person_reads(tmp_path: Path) -> None:
