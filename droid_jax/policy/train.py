@@ -49,7 +49,8 @@ class TrainConfig:
         learning_rate: of Adam; with `target_kl` the largest one.
         target_kl: Kullback-Leibler divergence of an update from the policy that acted.  The learning rate is reduced
             where it is more than twice as large, and raised again where it is less than half, so that a policy that
-            opens nearly all doors is not lost again.  None: a constant rate.
+            opens nearly all doors is not lost again.  But it explores less: of doors with a latch one training with 0.01
+            opened none in 3.5 million actions.  None: a constant rate.
         discount: discount factor.
         gae: lambda of generalised advantage estimation.
         clip: clipping range of the probability ratio.
@@ -74,7 +75,7 @@ class TrainConfig:
     devices: int | None = None
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
-    target_kl: float | None = 0.01
+    target_kl: float | None = None
     discount: float = 0.98
     gae: float = 0.95
     clip: float = 0.2
