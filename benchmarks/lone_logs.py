@@ -153,6 +153,7 @@ class Bench:
     demonstration: Recording
     effects: tuple[Effect, ...]
     channels: tuple[str, ...]
+    noise: float  # rad, of a position sample
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,8 @@ def bench(scene: str, channels: str, so101: Path | None = None) -> Bench:
     convention = TorqueConvention(TorqueSide.MOTOR, gravity=True)
     demonstration = Recording("log", clock, command, joints, {}, convention, qpos0=start)
     effects = observable_effects(model, [demonstration], channels=compared)
-    return Bench(scene, model, base, demonstration, effects, compared)
+    noise = SO101_NOISE if scene == OTHER[0] else NOISE
+    return Bench(scene, model, base, demonstration, effects, compared, noise)
 
 
 def _arm_base(scene: Scene) -> Space:
@@ -241,8 +243,7 @@ def recorded(bench: Bench, plan: Plan, seed: int) -> tuple[Recording, Applied | 
     rng, base = np.random.default_rng(seed), bench.base
     values = rng.normal(base.mean, np.where(base.nuisance, 1.0, 0.5) * base.std)
     truth = dict(zip(base.names, np.clip(values, base.low, base.high).tolist(), strict=True))
-    noise = SO101_NOISE if plan.scene == OTHER[0] else NOISE
-    config = SyntheticRobotConfig(repeats=1, position_noise=noise)
+    config = SyntheticRobotConfig(repeats=1, position_noise=bench.noise)
     hidden = None
     if plan.effect:
         kind, _, joint = plan.effect.rstrip("]").partition("[")
@@ -371,7 +372,8 @@ def main(arguments: Arguments) -> None:
             if not mine or path.is_file():
                 continue
             key = plan.scene, plan.channels
-            benches.setdefault(key, bench(*key, arguments.so101))
+            if key not in benches:  # a bench per case would have other effects, and trace every program again
+                benches[key] = bench(*key, arguments.so101)
             seed = int(np.random.default_rng([arguments.seed, *plan.name.encode()]).integers(1 << 31))
             found = made(benches[key], plan, seed, arguments)
             write_json(path, found)

@@ -54,14 +54,8 @@ HERE = ROOT / "experiments"
 STEP = 0.002  # s, of the fits of spring and arm
 JUDGING_GAIN = 400  # of the XL330
 SYNTHETIC, REAL = ("spring", "arm", "door"), ("go2", "xl330", "so101")
-# The search of this program is that of `identify --preset quick`.
-BUDGET = {
-    "population": 30, "generations": 20, "generations_in_c": 5, "samples": 64, "cma_generations": 200,
-    "iterations": 200,
-}  # fmt: skip
-QUICK = {
-    "population": 8, "generations": 2, "generations_in_c": 2, "samples": 16, "cma_generations": 3, "iterations": 3,
-}  # fmt: skip
+BUDGET = {"population": 30, "generations": 20, "samples": 64, "cma_generations": 200, "iterations": 200}
+QUICK = {"population": 8, "generations": 2, "samples": 16, "cma_generations": 3, "iterations": 3}
 
 
 @dataclass(frozen=True)
@@ -131,8 +125,8 @@ def real_logs(name: str, data: Path, quick: bool) -> Logs:
 def door_logs() -> Logs:
     """Table I's door with one spring; the last repeats of demonstrations A and C are the test data."""
     scene = door_scene(timestep=doors.OURS)
-    fit, judge, _ = zip(*(split_repeats(r, 0.3) for r in recordings(scene, synthetic_truth(scene, 1, 1), "AC", 1)),
-                     strict=True)  # fmt: skip
+    logs = recordings(scene, synthetic_truth(scene, 1, 1), "AC", 1)
+    fit, judge, _ = zip(*(split_repeats(r, 0.3) for r in logs), strict=True)
     asked = {"scene": DOOR, "channels": ["torque"], "refinement_only": False}
     return Logs(list(fit), list(judge), asked, {})
 

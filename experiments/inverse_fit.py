@@ -34,6 +34,7 @@ from droid_jax.identify.multistart import Refined, refine
 from droid_jax.identify.search import CmaConfig, cma_search
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Space
+from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.checks import validate
 from droid_jax.recordings.clocks import interpolate
@@ -180,6 +181,17 @@ def estimate(cost: Cost, space: Space, start: np.ndarray, block: float) -> Estim
     samples, columns = left.shape
     blocks = time_blocks([(columns, samples)], [samples / noise.DEFAULT_NOISE.rate], block)
     return Estimate(space, refined.best, calibrated(refined, (), blocks), refined)  # one repeat: no scatter
+
+
+def possible_bodies(scene: Scene, space: Space, draws: np.ndarray, links: Sequence[str]) -> dict[str, int]:
+    """Number of draws [N, D], and of those whose links have an inertia that a body can have, in compiled models."""
+    rows, possible = [scene.id("body", link) for link in links], 0
+    for values in draws:
+        model = make_c_model(scene, space, values)
+        moments = np.sort(model.body_inertia[rows], axis=1)
+        positive = (model.body_mass[rows] > 0) & (moments[:, 0] > 0)
+        possible += bool(np.all(positive & (moments[:, 2] <= moments[:, :2].sum(axis=1) * (1 + 1e-9))))
+    return {"draws": len(draws), "possible": possible}
 
 
 def table(result: Estimate) -> list[dict[str, Any]]:

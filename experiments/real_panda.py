@@ -55,6 +55,7 @@ from inverse_fit import (
     find,
     inverse_cost,
     make_recording,
+    possible_bodies,
     publish,
     read_npz,
     resampled,
@@ -75,7 +76,6 @@ from droid_jax.model.fields import body_mass_scale, model_parameter
 from droid_jax.model.inertia import inertia_parameters
 from droid_jax.model.joint_friction import SMOOTHING, joint_friction_space
 from droid_jax.model.parameters import Mode, Parameter, Space
-from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.report import style
@@ -183,18 +183,6 @@ def link_bodies(scene: Scene) -> Space:
     """The whole inertia of every link."""
     each = (inertia_parameters(scene, link, std=BODY_STD, nuisance=True, group="Nuisance") for link in LINKS)
     return Space(tuple(p for parameters in each for p in parameters))
-
-
-def possible_bodies(scene: Scene, found: Estimate, seed: int) -> dict[str, Any]:
-    """Number of draws of the Gaussian whose seven link inertias are valid in compiled models."""
-    rows = [scene.id("body", link) for link in LINKS]
-    possible = 0
-    for values in found.gaussian.sample(seed, DRAWS):
-        model = make_c_model(scene, found.space, values)
-        moments = np.sort(model.body_inertia[rows], axis=1)
-        fits = (model.body_mass[rows] > 0) & (moments[:, 0] > 0)
-        possible += bool(np.all(fits & (moments[:, 2] <= moments[:, :2].sum(axis=1) * (1 + 1e-9))))
-    return {"draws": DRAWS, "possible": possible}
 
 
 def model_space(scene: Scene, model: str) -> Space:
@@ -354,7 +342,10 @@ def main(config: RealPanda) -> None:
     fits = fit_models(scene, parts, config)
     search, others, clock = fits.pop("search"), fits.pop("other_priors", []), fits.pop("held_out_clock")
     held = fits.pop("set_valued", None)
-    bodies = possible_bodies(scene, fits["bodies"]["estimate"], config.seed) if "bodies" in fits else None
+    bodies = None
+    if "bodies" in fits:
+        found = fits["bodies"]["estimate"]
+        bodies = possible_bodies(scene, found.space, found.gaussian.sample(config.seed, DRAWS), LINKS)
     results = {model: summary(fit, published) for model, fit in fits.items()}
     for model, result in results.items():
         show(model, result)

@@ -32,14 +32,13 @@ import mujoco
 import numpy as np
 import tyro
 from commanded_fit import HERE, command, evaluated, fitted, kept, parameters_of
-from inverse_fit import RESULTS, run
+from inverse_fit import RESULTS, possible_bodies, run
 
 from benchmarks import common
 from droid_jax.files import EXTENDED, FULL_GAUSSIAN, GAP
 from droid_jax.identify.evaluation import evaluate_on
 from droid_jax.identify.gaussian import load_gaussian
 from droid_jax.model.parameter_file import friction_joints, load_parameters
-from droid_jax.model.physics import make_c_model
 from droid_jax.model.scene import load_scene
 from droid_jax.recordings.formats import load_recording
 from droid_jax.recordings.recording import Recording
@@ -138,7 +137,7 @@ def searched(config: RealSo101) -> dict[str, Any]:
     """Result of `gap` on the four motions, and the errors of all six motions, of the first five joints."""
     seconds = 15.0 if config.quick else config.seconds
     of = {motion: so101_log(config.data, motion, seconds) for motion in (*JUDGES, *FIT)}
-    runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
+    runs = runs_of(config)
     paths = kept(list(of.values()), runs / "logs_of_all_joints")
     options = ["--effects", "soft_friction"] if config.quick else []
     options += ["--budget", str(config.budget)] if config.budget else []
@@ -207,50 +206,68 @@ def _entry(field: str, link: str, value: float, unit: str, **column: int) -> dic
     return {"field": field, "name": name, "element": link, **column, **width, "nuisance": True, "group": "Inertia"}
 
 
-def possible_bodies(config: RealSo101, parameters: Path, fit: Path) -> int:
-    """Number of DRAWS of a fit's Gaussian whose links are possible bodies, in compiled models."""
-    scene, gaussian = load_scene(scene_of(config.data), joints=JUDGED), load_gaussian(fit / FULL_GAUSSIAN)
-    full = load_parameters(parameters, scene)
-    space = full.select(n for n in gaussian.space.names if n in full.names)
-    rows, possible = [scene.id("body", link) for link in LINKS], 0
-    for values in gaussian.sample(config.seed, DRAWS):
-        model = make_c_model(scene, space, values[gaussian.space.columns(space)])
-        moments = np.sort(model.body_inertia[rows], axis=1)
-        positive = (model.body_mass[rows] > 0) & (moments[:, 0] > 0)
-        possible += bool(np.all(positive & (moments[:, 2] <= moments[:, :2].sum(axis=1) * (1 + 1e-9))))
-    return possible
+@dataclass(frozen=True)
+class Tested:
+    """A fit to FIT, tested on JUDGES.  logs: of both.  mae: mrad by motion, before and after."""
+
+    logs: list[Recording]
+    folder: Path
+    found: dict[str, Any]
+    seconds: float
+    mae: dict[str, dict[str, float]]
+    judges: tuple[str, ...]
+
+    def mean_judged(self, when: str) -> float:
+        """mrad, over the test motions."""
+        return round(float(np.mean([self.mae[when][name] for name in self.judges])), 3)
+
+
+def runs_of(config: RealSo101) -> Path:
+    """Folder of the runs."""
+    return config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
+
+
+def tested(config: RealSo101, parameters: Path, kind: str = "") -> Tested:
+    """The fit of a parameter file, in folders whose names end with `kind`."""
+    seconds = 4.0 if config.quick else config.seconds
+    fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
+    logs = [so101_log(config.data, motion, seconds) for motion in (*fit, *judges)]
+    runs = runs_of(config)
+    paths, folder = kept(logs, runs / "logs"), runs / f"identify{kind}"
+    options = ["--joints", *JUDGED, "--effects", *EFFECTS, "--seed", str(config.seed)]
+    options += ["--generations", "3"] if config.quick else []
+    given, test = ([paths[name] for name in names] for names in (fit, judges))
+    found, took = fitted(scene_of(config.data), parameters, given, test, folder, options)
+    errors = evaluated(folder, [*given, *test], runs / f"evaluation{kind}")["errors"]
+    mae = {
+        when: {name: _mrad(of["position"][f"mae_{when}"]) for name, of in errors.items()}
+        for when in ("before", "after")
+    }
+    return Tested(logs, folder, found, round(took, 1), mae, judges)
 
 
 def with_links(config: RealSo101) -> dict[str, Any]:
     """Both fits with the links' inertias: errors of the first five joints, and draws that are possible bodies."""
-    seconds = 4.0 if config.quick else config.seconds
-    fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
-    runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
-    paths = kept([so101_log(config.data, motion, seconds) for motion in (*fit, *judges)], runs / "logs")
-    options = ["--joints", *JUDGED, "--effects", *EFFECTS, "--seed", str(config.seed)]
-    options += ["--generations", "3"] if config.quick else []
     scene, out = load_scene(scene_of(config.data), joints=JUDGED), dict[str, Any]()
     files = {
-        kind: parameters_with_links(runs / f"so101_{kind}.json", scene.model, kind == "possible_bodies")
+        kind: parameters_with_links(runs_of(config) / f"so101_{kind}.json", scene.model, kind == "possible_bodies")
         for kind in ("possible_bodies", "free_entries")
     }
-    for parameters in files.values():
-        load_parameters(parameters, scene)  # both are valid, before anything takes long
+    # Read here, so that errors in them are raised before anything takes long.
+    spaces = {kind: load_parameters(file, scene) for kind, file in files.items()}
     for kind, parameters in files.items():
-        given, test = ([paths[name] for name in names] for names in (fit, judges))
-        folder = runs / f"identify_{kind}"
-        found, took = fitted(scene_of(config.data), parameters, given, test, folder, options)
-        errors = evaluated(folder, [paths[name] for name in (*fit, *judges)], runs / f"evaluation_{kind}")["errors"]
-        mae = {name: _mrad(of["position"]["mae_after"]) for name, of in errors.items()}
-        of_links = [p for p in found["parameters"] if p["group"] == "Inertia"]
+        fit = tested(config, parameters, f"_{kind}")
+        gaussian, full = load_gaussian(fit.folder / FULL_GAUSSIAN), spaces[kind]
+        space = full.select(n for n in gaussian.space.names if n in full.names)
+        draws = gaussian.sample(config.seed, DRAWS)[:, gaussian.space.columns(space)]
+        of_links = [p for p in fit.found["parameters"] if p["group"] == "Inertia"]
         out[kind] = {
-            "mean_judged_mrad": round(float(np.mean([mae[name] for name in judges])), 3),
-            "mae_mrad": mae,
-            "draws": DRAWS,
-            "possible": possible_bodies(config, parameters, folder),
+            "mean_judged_mrad": fit.mean_judged("after"),
+            "mae_mrad": fit.mae["after"],
+            **possible_bodies(scene, space, draws, LINKS),
             "numbers_of_links": len(of_links),
             "not_identifiable": [p["name"] for p in of_links if not p["identifiable"]],
-            "seconds": round(took, 1),
+            "seconds": fit.seconds,
         }
     return out
 
@@ -272,42 +289,20 @@ def main(config: RealSo101) -> None:
         write_json(path, known, indent=2)
         print(json.dumps({"links": known["links"]}))
         return
-    seconds = 4.0 if config.quick else config.seconds
-    fit, judges = (FIT[:1], JUDGES[:1]) if config.quick else (FIT, JUDGES)
-    logs = [so101_log(config.data, motion, seconds) for motion in (*fit, *judges)]
-    runs = config.out / ("real_so101_quick_runs" if config.quick else "real_so101_runs")
-    paths = kept(logs, runs / "logs")
-    options = [
-        "--joints",
-        *JUDGED,
-        "--effects",
-        *EFFECTS,
-        "--seed",
-        str(config.seed),
-        *(["--generations", "3"] if config.quick else []),
-    ]
-    judge_on = [paths[name] for name in judges]
-    found, took = fitted(
-        scene_of(config.data), HERE / "so101.json", [paths[n] for n in fit], judge_on, runs / "identify", options
-    )
-    errors = evaluated(runs / "identify", [paths[name] for name in (*fit, *judges)], runs / "evaluation")["errors"]
-    mae = {
-        when: {name: round(1e3 * float(np.mean(of["position"][f"mae_{when}"])), 3) for name, of in errors.items()}
-        for when in ("before", "after")
-    }
+    fit = tested(config, HERE / "so101.json")
     result = {
         "experiment": "real_so101",
         "source": SOURCE,
-        "recordings": {r.name: r.sha256 for r in logs},
-        "seconds_of_each_motion": {r.name: round(r.duration, 2) for r in logs},
-        "mean_judged_mrad": round(float(np.mean([mae["after"][name] for name in judges])), 3),
-        "mean_judged_mrad_before": round(float(np.mean([mae["before"][name] for name in judges])), 3),
-        "mae_mrad": mae["after"],
-        "mae_mrad_before": mae["before"],
+        "recordings": {r.name: r.sha256 for r in fit.logs},
+        "seconds_of_each_motion": {r.name: round(r.duration, 2) for r in fit.logs},
+        "mean_judged_mrad": fit.mean_judged("after"),
+        "mean_judged_mrad_before": fit.mean_judged("before"),
+        "mae_mrad": fit.mae["after"],
+        "mae_mrad_before": fit.mae["before"],
         "effects": list(EFFECTS),
         "tied": [],
-        "parameters": parameters_of(found),
-        "seconds": round(took, 1),
+        "parameters": parameters_of(fit.found),
+        "seconds": fit.seconds,
         **{key: known[key] for key in ("gap", "links") if key in known},
     }
     common.publish(config.out, "real_so101", config.quick, config.seed, result)

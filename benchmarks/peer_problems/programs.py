@@ -87,15 +87,15 @@ def ours(task: Problem) -> dict[str, Any]:
 
         found = springs.refined(task.scene, task.space, task.fit[0], "mujoco")
         return {"values": found.best}
+    from droid_jax.commands.options import quick_settings
     from droid_jax.identify.pipeline import IdentifyConfig, identify_parameters
     from droid_jax.identify.search import CmaConfig
 
+    in_c = quick_settings("quick")["generations_in_c"]  # as `identify`
     search = CmaConfig(population=task.asked["population"], parents=None, generations=task.asked["generations"])
     found = identify_parameters(
         task.scene, task.space, task.fit, nuisances=task.nuisances,
-        config=IdentifyConfig(
-            search=search, generations_in_c=task.asked.get("generations_in_c"), heldout=0.0, checks=False
-        ),
+        config=IdentifyConfig(search=search, generations_in_c=in_c, heldout=0.0, checks=False),
     )  # fmt: skip
     return {"values": found.best, "interval": found.full_gaussian.interval(LEVEL), "engine": found.engine.engine}
 

@@ -221,10 +221,9 @@ def identifiability_of(
 
 def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> str:
     """Return "mujoco" if plain C can replay the recordings, since it needs no compilation; else "mjx"."""
-    contacts = scene.grip is not None or scene.model.npair
     for recording in recordings:
         own = variant_scene(scene, recording.variant, recording.name)
-        if recording.command.size and (contacts or why_not_in_c(own, space, recording.torque, ())):
+        if recording.command.size and (scene.has_contacts or why_not_in_c(own, space, recording.torque, ())):
             return "mjx"
         if not recording.command.size and why_no_path_in_c(space, recording.torque, ()):
             return "mjx"

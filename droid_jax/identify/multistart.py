@@ -129,8 +129,8 @@ class RefineInCConfig:
 
     In C there are no blocks of rows to fill, so fewer candidate steps are cheaper.  There are no contact pairs, whose
     sticking and slipping makes small basins, so no searches for better basins are needed.  In double precision one pass
-    over the posterior's axes gives the final Jacobian.  Corrected Jacobians save hardly any replays
-    beside so few candidate steps.
+    over the posterior's axes gives the final Jacobian.  Corrected Jacobians save hardly any replays beside so few
+    candidate steps.
 
     dampings, lengths, secant_ridge, patience, basin_hops, spreads: see `RefineConfig`.
     """

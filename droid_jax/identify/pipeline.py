@@ -408,8 +408,8 @@ def run_fit(problem: Preparation, *, checkpoints: Path | None = None, progress: 
 
 def _search_settings(config: IdentifyConfig, engine: str, scene: Scene) -> CmaConfig:
     """The search's settings for an engine and a scene."""
-    most, contacts = config.generations_in_c, scene.grip is not None or scene.model.npair > 0
-    if engine == "mjx" or contacts or config.refine is None or most is None:
+    most = config.generations_in_c
+    if engine == "mjx" or scene.has_contacts or config.refine is None or most is None:
         return config.search
     return replace(config.search, generations=min(config.search.generations, most))
 

@@ -102,6 +102,11 @@ class Scene:
         kinds = {self.slides(joint) for joint in joints}
         return " or ".join(unit for unit, slides in ((hinge, False), (slide, True)) if slides in kinds)
 
+    @property
+    def has_contacts(self) -> bool:
+        """Whether it has a grip, or contact pairs."""
+        return self.grip is not None or self.model.npair > 0
+
     @functools.cached_property
     def joint_dofs(self) -> np.ndarray:
         """[J] velocity addresses of `joints`."""

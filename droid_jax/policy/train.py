@@ -46,11 +46,7 @@ class TrainConfig:
         envs: environments in parallel, over all devices.
         devices: number of devices; None: the most that divide `envs` and `batch`.
         hidden: sizes of the hidden layers of actor and critic.
-        learning_rate: of Adam; with `target_kl` the largest one.
-        target_kl: Kullback-Leibler divergence of an update from the policy that acted.  The learning rate is reduced
-            where it is more than twice as large, and raised again where it is less than half, so that a policy that
-            opens nearly all doors is not lost again.  But it explores less: of doors with a latch one training with 0.01
-            opened none in 3.5 million actions.  None: a constant rate.
+        learning_rate: of Adam.
         discount: discount factor.
         gae: lambda of generalised advantage estimation.
         clip: clipping range of the probability ratio.
@@ -75,7 +71,6 @@ class TrainConfig:
     devices: int | None = None
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
-    target_kl: float | None = None
     discount: float = 0.98
     gae: float = 0.95
     clip: float = 0.2
@@ -100,7 +95,6 @@ class TrainConfig:
             **dict.fromkeys(("discount", "gae"), partial(number, least=0, most=1)),
             devices=optional(partial(whole, least=1)),
             hidden=several(partial(whole, least=1)),
-            target_kl=optional(partial(number, above=0)),
             entropy=partial(number, least=0),
             enough=partial(number, above=0, most=1),
             held=partial(whole, least=0),
@@ -113,7 +107,6 @@ class TrainConfig:
             )
 
 
-SMALLEST_RATE = 1e-5  # brax's own, of the schedule of `TrainConfig.target_kl`
 PRESETS = {
     "quick": TrainConfig(),
     "paper": TrainConfig(steps=20_000_000, batch=64, evaluations=40, eval_envs=128),
@@ -182,7 +175,7 @@ def train(
         randomise: draws the physics of the environments; None: all have those of `env`.
         config: settings of PPO.
         checkpoints: folder for the networks after each evaluation; an interrupted training continues from it, with the
-            same draws of the physics, but with new moments of Adam, the largest learning rate and new starts.
+            same draws of the physics, but with new moments of Adam and new starts.
         fingerprint: further properties that must agree with those of a checkpoint.
         progress: is called after each evaluation.
 
@@ -301,7 +294,6 @@ def _ppo(
         num_envs=config.envs,
         episode_length=env.task.steps,
         learning_rate=config.learning_rate,
-        **_schedule(config),
         entropy_cost=config.entropy,
         discounting=config.discount,
         unroll_length=config.unroll,
@@ -323,18 +315,6 @@ def _ppo(
         restore_params=restore,
         **hooks,
     )
-
-
-def _schedule(config: TrainConfig) -> dict[str, Any]:
-    """Arguments of brax's PPO for the learning rate's schedule."""
-    if config.target_kl is None:
-        return {}
-    return {
-        "learning_rate_schedule": "ADAPTIVE_KL",
-        "desired_kl": config.target_kl,
-        "learning_rate_schedule_max_lr": config.learning_rate,
-        "learning_rate_schedule_min_lr": min(SMALLEST_RATE, config.learning_rate),
-    }
 
 
 class _Ended(Exception):

@@ -62,7 +62,7 @@ def choose_engine(
         return EngineChoice("mjx", "a log without commands is replayed by inverse dynamics")
     if any(recording.repeats > 1 for recording in recordings):
         return EngineChoice("mjx", "repeats resolve the error of C's first-order steps")
-    if scene.grip is not None or scene.model.npair:
+    if scene.has_contacts:
         return EngineChoice("mjx", "contact pairs need its second-order step")
     reasons = [why_not_in_c(variant_scene(scene, r.variant, r.name), space, r.torque, effects) for r in recordings]
     if reason := next(filter(None, reasons), None):

@@ -36,7 +36,9 @@ def score_folder(results: Path, sealed: Path, limits: Mapping[str, Any], oracles
         if not result.is_file():
             missing.setdefault(truth["scene"], []).append(path.stem)
             continue
-        scene = scenes.setdefault(truth["scene"], setting(truth["scene"]).scene)
+        if truth["scene"] not in scenes:
+            scenes[truth["scene"]] = setting(truth["scene"]).scene
+        scene = scenes[truth["scene"]]
         names = [list(right(scene, Applied(**h))) for h in truth["hidden"]]
         found.append(
             {

@@ -170,8 +170,8 @@ def test_a_step_selects_an_effect_and_does_not_change_its_state(found: Small, fi
     assert vars(begin) == before and begin.model is found.base and begin.steps == ()
     np.testing.assert_array_equal(found.base.values, values)
     assert info is not None and info.selected is not None and state.model.keys == (PRELOAD,) == info.selected.keys
-    assert state.steps == (info,) and not state.finished and not state.exhausted and state.notes.failed == ()
-    assert state.notes.ruled_out == ((EffectKey("drag", "door"),),) and not state.notes.not_tried
+    assert state.steps == (info,) and not state.finished and not state.exhausted
+    assert state.notes == Notes(ruled_out=((EffectKey("drag", "door"),),))
     again, same = selection_step(begin, problem_of(found))  # the same state, the same step
     assert same is not None and again.model.keys == state.model.keys
     np.testing.assert_array_equal(again.model.values, state.model.values)

@@ -21,12 +21,10 @@ from droid_jax.policy.randomise import randomised
 from droid_jax.policy.train import (
     _NAMES,
     PRESETS,
-    SMALLEST_RATE,
     TrainConfig,
     TrainProgress,
     _brax,
     _devices,
-    _schedule,
     evaluations_left,
     from_tree,
     put_replicated,
@@ -78,21 +76,11 @@ def test_networks_are_restored_from_a_tree_and_others_refused():
         ({"devices": 0}, "devices must be at least 1, got 0"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"evaluations": 0}, "evaluations must be at least 1, got 0"),
-        ({"target_kl": 0.0}, "target_kl must be above 0, got 0"),
     ],
 )
 def test_inconsistent_settings_are_refused(changes, said: str):
     with pytest.raises(ValueError, match=said):
         train(object.__new__(DoorEnv), config=replace(SHORT, **changes))
-
-
-def test_the_learning_rate_adapts_below_its_largest_value_unless_it_is_constant():
-    assert _schedule(replace(SHORT, target_kl=None)) == {}
-    for rate, least in ((1e-3, SMALLEST_RATE), (1e-6, 1e-6)):
-        bounds = _schedule(replace(SHORT, learning_rate=rate, target_kl=0.02))
-        assert bounds["desired_kl"] == 0.02
-        assert bounds["learning_rate_schedule_max_lr"] == rate
-        assert bounds["learning_rate_schedule_min_lr"] == least
 
 
 def test_the_number_of_devices_divides_the_environments(monkeypatch: pytest.MonkeyPatch):
