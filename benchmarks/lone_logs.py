@@ -372,7 +372,7 @@ def main(arguments: Arguments) -> None:
             if not mine or path.is_file():
                 continue
             key = plan.scene, plan.channels
-            if key not in benches:  # a bench per case would have other effects, and trace every program again
+            if key not in benches:
                 benches[key] = bench(*key, arguments.so101)
             seed = int(np.random.default_rng([arguments.seed, *plan.name.encode()]).integers(1 << 31))
             found = made(benches[key], plan, seed, arguments)
