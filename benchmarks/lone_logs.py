@@ -46,7 +46,7 @@ from droid_jax.door.space import torque_offsets  # noqa: E402
 from droid_jax.model.effect_interface import Effect  # noqa: E402
 from droid_jax.model.effects.candidate import candidates, names_of  # noqa: E402
 from droid_jax.model.effects.registry import ready  # noqa: E402
-from droid_jax.model.fields import body_mass, joint_damping, servo_scale, time_offset  # noqa: E402
+from droid_jax.model.fields import body_mass, joint_damping, joint_frictionloss, servo_scale, time_offset  # noqa: E402
 from droid_jax.model.parameter_file import friction_joints, load_parameters  # noqa: E402
 from droid_jax.model.parameters import Space  # noqa: E402
 from droid_jax.model.scene import Scene, compile_scene, load_scene  # noqa: E402
@@ -69,6 +69,7 @@ SECONDS = 24.0
 HELD = 1.5  # s, before that: the robot settles where its servos hold it, and no log begins with a jolt
 NOISE = 1e-4  # rad, of a position sample
 SO101_NOISE = 4.4e-4  # rad, the deviation of rounding to its encoder's 4096 counts
+STEP_EVERY, STEP_SIZE = 1.7, 0.3  # s and rad, of a servo's goal
 FACTORS = (3.0, 10.0)  # of the minimum effect size
 STROKES = ((3.0, 0.9), (5.0, 0.9), (4.6, 0.8), (3.4, 0.95), (2.6, 0.75), (5.4, 0.85))  # s and rad, there and back
 ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
@@ -82,6 +83,12 @@ ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <actuator><position name="yaw" joint="yaw" kp="400"/><position name="shoulder" joint="shoulder" kp="900"/>
     <position name="elbow" joint="elbow" kp="400"/></actuator></mujoco>"""
 JOINTS = ("yaw", "shoulder", "elbow")
+SERVO = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><body name="arm">
+  <joint name="j" axis="0 1 0" armature="0.01" damping="0.3" {friction}/>
+  <geom type="capsule" size="0.01" fromto="0 0 0 0.15 0 0" mass="0.2" contype="0" conaffinity="0"/>
+  <geom type="sphere" size="0.03" pos="0.15 0 0" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>
+  <actuator><position name="j" joint="j" kp="20"/></actuator></mujoco>"""
+SOFT, SERVO_FRICTION = "soft_servo", 0.1  # N m, of its joint friction, which creeps in the model
 SO101 = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 # rad, rad/s, rad: two sines a joint
 WAVES = (
@@ -100,16 +107,20 @@ HIDDEN = {
         "joint_elasticity[elbow]", "servo_gains[shoulder]", "command_delay", "encoder_zero[elbow]", "tilted_base",
     ),
 }  # fmt: skip
-SETUP = {  # what is wrong with the set-up, not with the machine; of torques alone what only their sensors show
+SETUP = {  # the set-up and the servos; of torques alone what only their sensors show
     "hinge": ("clock_rate",),  # a delay of the commands is its base's own time offset
+    "servo": ("tilted_base", "clock_rate", "held_thing", "torque_gain[j]", "mesh_friction[j]", "inner_profile[j]",
+              "torque_line[j]", "free_play[j]", "resonance[j]"),
+    SOFT: ("firm_friction[j]",),
     "arm": ("tilted_base", "encoder_zero[elbow]", "clock_rate", "held_thing", "inner_profile[shoulder]",
-            "torque_gain[shoulder]", "crosstalk[elbow]", "mesh_friction[shoulder]"),
+            "torque_gain[shoulder]", "crosstalk[elbow]", "mesh_friction[shoulder]", "torque_line[shoulder]",
+            "free_play[elbow]", "resonance[elbow]"),
 }  # fmt: skip
 OF_SENSORS = ("torque_gain", "crosstalk")
 SETS = {"library": HIDDEN, "setup": SETUP}
 NAMES = {"library": "lone_logs", "setup": "setup_errors"}  # of the results
 CHANNELS = {"positions": ("position",), "torques": ("torque", "position")}
-COMBINATIONS = [(scene, channels) for scene in HIDDEN for channels in CHANNELS]
+COMBINATIONS = {name: [(scene, channels) for scene in kinds for channels in CHANNELS] for name, kinds in SETS.items()}
 OTHER = ("so101", "positions")  # with nothing hidden
 
 
@@ -176,6 +187,11 @@ def bench(scene: str, channels: str, so101: Path | None = None) -> Bench:
     elif scene == "arm":
         model = ready(compile_scene(mujoco.MjSpec.from_string(ARM), "arm", joints=JOINTS))
         base, joints, command = _arm_base(model), JOINTS, _waves(np.maximum(clock - HELD, 0.0), JOINTS)
+    elif scene in ("servo", SOFT):
+        friction = f'frictionloss="{SERVO_FRICTION}"' if scene == SOFT else ""
+        spec, joints = mujoco.MjSpec.from_string(SERVO.format(friction=friction)), ("j",)
+        model = ready(compile_scene(spec, "servo", joints=joints))
+        base, command = _servo_base(model), _waves(np.maximum(clock - HELD, 0.0), joints) + _steps(clock - HELD)
     else:
         assert so101 is not None  # its cases are planned only then
         file = ROOT / "experiments" / "so101.json"
@@ -198,6 +214,14 @@ def _arm_base(scene: Scene) -> Space:
     return Space((*damping, mass, *servos, time_offset(), *torque_offsets(JOINTS)))
 
 
+def _servo_base(scene: Scene) -> Space:
+    rubs = scene.spec.joint("j").frictionloss > 0
+    friction = (joint_frictionloss(scene, "j", std=0.3 * SERVO_FRICTION, high=1.0),) if rubs else ()
+    mass, gain = body_mass(scene, "arm", std=0.1, high=3.0), servo_scale(scene, "j", nuisance=True)
+    damping = joint_damping(scene, "j", std=0.1, high=3.0)
+    return Space((damping, *friction, mass, gain, time_offset(), *torque_offsets(("j",))))
+
+
 def _strokes(clock: np.ndarray) -> np.ndarray:
     angle, start = np.full(len(clock), AJAR), 0.0
     for seconds, reach in STROKES:
@@ -207,6 +231,12 @@ def _strokes(clock: np.ndarray) -> np.ndarray:
     return angle
 
 
+def _steps(clock: np.ndarray) -> np.ndarray:
+    """[T, 1] rad, jumps of a servo's goal in the second half of a log."""
+    count = np.floor((clock - 0.5 * SECONDS) / STEP_EVERY)
+    return np.where(count >= 0, STEP_SIZE * (count % 2), 0.0)[:, None]
+
+
 def _waves(clock: np.ndarray, joints: Sequence[str]) -> np.ndarray:
     swings = [sum(size * np.sin(w * clock + phase) for size, w, phase in waves) for waves in WAVES[: len(joints)]]
     return minimum_jerk(clock / 1.5)[:, None] * np.stack(swings, axis=1)
@@ -214,24 +244,30 @@ def _waves(clock: np.ndarray, joints: Sequence[str]) -> np.ndarray:
 
 def plans(arguments: Arguments) -> list[Plan]:
     """All cases, ordered so that a stopped run has some of every kind."""
-    unchanged = [*COMBINATIONS, *([OTHER] if arguments.so101 or arguments.sum_only else [])]
+    combinations, kinds = COMBINATIONS[arguments.hidden], SETS[arguments.hidden]
+    unchanged = [*combinations, *([OTHER] if arguments.so101 or arguments.sum_only else [])]
     null = [Plan(f"null-{scene}-{channels}-{n}", scene, channels)
             for n in range(1 if arguments.quick else arguments.null) for scene, channels in unchanged]  # fmt: skip
-    hidden = list[Plan]()
-    count, kinds = 1 if arguments.quick else arguments.blind, SETS[arguments.hidden]
+    count = 1 if arguments.quick else arguments.blind
     lists = {
         (scene, channels): [
             (e, f) for e in kinds[scene] for f in FACTORS if channels == "torques" or not e.startswith(OF_SENSORS)
         ]
-        for scene, channels in COMBINATIONS
+        for scene, channels in combinations
     }
-    for n in range(count):
-        scene, channels = key = COMBINATIONS[n % len(COMBINATIONS)]
-        each = lists[key]
-        order = np.random.default_rng([arguments.seed, COMBINATIONS.index(key)]).permutation(len(each))
-        effect, factor = each[order[(n // len(COMBINATIONS)) % len(each)]]
-        kind = "blind" if arguments.hidden == "library" else arguments.hidden
-        hidden.append(Plan(f"{kind}-{scene}-{channels}-{n}", scene, channels, effect, factor))
+    if arguments.hidden == "library":
+        hidden = list[Plan]()
+        for n in range(count):
+            scene, channels = key = combinations[n % len(combinations)]
+            each = lists[key]
+            order = np.random.default_rng([arguments.seed, combinations.index(key)]).permutation(len(each))
+            effect, factor = each[order[(n // len(combinations)) % len(each)]]
+            hidden.append(Plan(f"blind-{scene}-{channels}-{n}", scene, channels, effect, factor))
+    else:  # every kind once, then some of them again
+        each = [(*key, *one) for key, some in lists.items() for one in some]
+        order = np.random.default_rng(arguments.seed).permutation(len(each))
+        drawn = [each[order[n % len(each)]] for n in range(count)]
+        hidden = [Plan(f"{arguments.hidden}-{one[0]}-{one[1]}-{n}", *one) for n, one in enumerate(drawn)]
     some = math.ceil(len(null) / max(len(hidden), 1))
     mixed = [p for n, one in enumerate(hidden) for p in (*null[n * some : (n + 1) * some], one)]
     mixed += null[len(hidden) * some :]
@@ -381,7 +417,7 @@ def main(arguments: Arguments) -> None:
                   f"p = {found.get('p')}, {found['seconds']:.0f} s {found.get('error', '')}", flush=True)  # fmt: skip
     cases = [json.loads(path.read_text()) for plan in wanted if (path := runs / f"{plan.name}.json").is_file()]
     groups = {f"{scene}, {channels}": [c for c in cases if (c["scene"], c["channels"]) == (scene, channels)]
-              for scene, channels in (*COMBINATIONS, OTHER)}  # fmt: skip
+              for scene, channels in (*COMBINATIONS[arguments.hidden], OTHER)}  # fmt: skip
     whole = summary(cases)
     result = {
         **whole,

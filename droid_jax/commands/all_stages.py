@@ -79,7 +79,7 @@ class All:
     joints creep."""
     motion_cutoff: float | None = None
     """Logs without commands: cutoff of the filter of the measured positions, Hz; default: 20."""
-    effect_scale: float = 1.0
+    effect_scale: float | None = None
     """Forces and torques of the library's effects, relative to an arm of a Panda's size, as in gap."""
     user_effects: Path | None = None
     """Python file that registers your own effects (docs/your-effect.md); it is executed."""
@@ -123,7 +123,8 @@ def run(command: All) -> None:
     runtime.start()  # before the recording, which would start jax without tune()
     from droid_jax.model.effects.registry import check_scale
 
-    check_scale(command.effect_scale)
+    if command.effect_scale is not None:
+        check_scale(command.effect_scale)
     load_effects(command.user_effects)
     roles = _roles(command)
     _needs_robot(command)

@@ -96,9 +96,10 @@ class GapCommand:
     """Effects of the library to test; default: all that the scene can have."""
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
-    effect_scale: float = 1.0
+    effect_scale: float | None = None
     """Factor on forces and torques of the library's effects (priors, bounds, minimum effect sizes), which are those of
-    an arm of a Panda's size. For an axis with forces of a kilonewton: 30."""
+    an arm of a Panda's size; default: by the robot's weight and inertia and the measured torques. For an axis with
+    forces of a kilonewton: 30."""
     user_effects: Path | None = None
     """Python file that registers your own effects (docs/your-effect.md); it is executed."""
     budget: float | None = None
@@ -185,6 +186,7 @@ def run(command: GapCommand) -> None:
         "setup": {
             **setup,
             "synthetic_robot": synthetic_robot,
+            "effect_scale": effect_scale(command, scene, given),
             "robot": robot,
             "hidden": in_words(robot.get("hide", ())),
         },
@@ -259,6 +261,13 @@ def values_of(folder: Path, base: Space) -> np.ndarray:
     return base.values({n: v for n, v in known.items() if n in base.names})
 
 
+def effect_scale(command: GapCommand, scene: Scene, recordings: Sequence[Recording]) -> float:
+    """Scale of the library's forces and torques: the given one, or that of the machine."""
+    from droid_jax.discrepancy.candidates import machine_scale
+
+    return machine_scale(scene, recordings) if command.effect_scale is None else command.effect_scale
+
+
 def chosen_effects(
     command: GapCommand, scene: Scene, recordings: list[Recording], channels: Sequence[str] = ()
 ) -> tuple[Effect, ...]:
@@ -276,7 +285,7 @@ def chosen_effects(
     if not channels:
         compared = comparing(scene, recordings, config).compare.channels if recordings else command.compare
         channels = tuple(compared) or ("torque",)
-    here = observable_effects(scene, recordings, command.effect_scale, channels)
+    here = observable_effects(scene, recordings, effect_scale(command, scene, recordings), channels)
     asked = {e.name for e in library(scene, command.effects or None)}
     names = {e.name for e in here}
     impossible = [name for name in command.effects if name not in names]

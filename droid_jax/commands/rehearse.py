@@ -80,7 +80,7 @@ class Rehearse:
     """Effects of the library to hide; default: all that the scene can have."""
     without: tuple[str, ...] = ()
     """Effects of the library to leave out."""
-    effect_scale: float = 1.0
+    effect_scale: float | None = None
     """Forces and torques of the library's effects, as in gap."""
     user_effects: Path | None = None
     """Python file that registers your own effects (docs/your-effect.md); it is executed."""

@@ -21,6 +21,7 @@ from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.statistics import largest_trend
 from droid_jax.model.effect_interface import Effect, Rollout
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of
+from droid_jax.model.effects.effect_scaling import scale_of, usual_torques
 from droid_jax.model.effects.registry import library
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
@@ -30,11 +31,12 @@ if TYPE_CHECKING:
     from droid_jax.discrepancy.fitting import FittedModel
 
 ACT_ON_COMMANDS = ("actuator_", "dof_sol", "pair_")  # beginnings of model fields that inverse dynamics does not read
+MEASURED = 0.98  # quantile of measured torques, as the largest of them
 SAMPLES = 16  # of a random motion, on which the effect of a sensor model is tried
 
 
 def observable_effects(
-    scene: Scene, recordings: Iterable[Recording], scale: float = 1.0, channels: Iterable[str] = ("torque",)
+    scene: Scene, recordings: Sequence[Recording], scale: float | None = None, channels: Iterable[str] = ("torque",)
 ) -> tuple[Effect, ...]:
     """The library's effects that can change the compared channels of these recordings.
 
@@ -43,12 +45,24 @@ def observable_effects(
     Args:
         scene: with the effects' joints and bodies.
         recordings: to be searched.
-        scale: of the effects' forces and torques, see `library`.
+        scale: of the effects' forces and torques, see `library`; None: that of the machine (`machine_scale`).
         channels: names of the compared channels.
     """
     commanded = all(r.command.size for r in recordings)
+    scale = machine_scale(scene, recordings) if scale is None else scale
     asked = (e for e in library(scene, scale=scale) if commanded or not acts_on_commands_only(e))
     return tuple(e for e in asked if shows_in(e, scene, channels))
+
+
+def machine_scale(scene: Scene, recordings: Sequence[Recording]) -> float:
+    """Scale of the library's forces and torques for a scene, by its weight and inertia and the measured torques."""
+    joints = [j for j in scene.joints if j in scene.single_joints and j != scene.object_joint]
+    measured = [
+        float(np.quantile(np.abs(channel.values[channel.mask]), MEASURED))
+        for channel in (r.channels["torque"] for r in recordings if "torque" in r.channels)
+        if channel.mask.any()
+    ]
+    return scale_of(max([*usual_torques(scene, joints), *measured], default=0.0))
 
 
 def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
@@ -57,7 +71,7 @@ def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
     An effect that moves the robot can change all of them.  A sensor model is tried on a random motion: a torque offset
     does not show in positions.
     """
-    moves = effect.command or effect.servo or effect.force or effect.frictionloss
+    moves = effect.command or effect.servo or effect.gear or effect.force or effect.frictionloss
     if moves or effect.observe is None or any(p.writes for p in effect.parameters):
         return True
     rng = np.random.default_rng(0)
@@ -76,7 +90,7 @@ def acts_on_commands_only(effect: Effect) -> bool:
     This includes effects without functions whose parameters write only model fields of these (`servo_gain`,
     `soft_friction`).
     """
-    if effect.profile or effect.command or effect.servo:
+    if effect.profile or effect.command or effect.servo or effect.gear:
         return True
     fields = [w.field for p in effect.parameters for w in p.writes]
     laws = (effect.force, effect.frictionloss, effect.observe)

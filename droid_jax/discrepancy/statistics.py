@@ -391,8 +391,10 @@ class Blocks:
         self, sensitivities: np.ndarray, base: np.ndarray, prior: np.ndarray, flips: np.ndarray
     ) -> np.ndarray:
         """[F, K] squared norm of each sensitivity after flipping and projection, |(1 - H) F z|^2."""
-        inverse = np.linalg.inv(base.T @ base + np.diag(prior**-2))
-        factor = np.linalg.cholesky(inverse + inverse @ np.diag(prior**-2) @ inverse)  # of 2 H - H^2
+        # 2 H - H^2 by singular values: normal equations of nearly dependent columns are no positive matrix in floats.
+        _, values, rows = np.linalg.svd(base * prior, full_matrices=False)
+        kept = 1.0 / (1.0 + values**2)
+        factor = prior[:, None] * rows.T * np.sqrt(kept + kept**2)
         shares = np.stack([(sensitivities * inside) @ base @ factor for inside in self._inside])  # [B, K, D]
         size = np.einsum("km,km->k", sensitivities, sensitivities)
         chunks = np.split(flips, np.arange(CHUNK, len(flips), CHUNK))

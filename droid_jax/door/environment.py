@@ -27,25 +27,18 @@ from droid_jax.door.task import (
     terms,
 )
 from droid_jax.model.actuators import has_servo_damping
-from droid_jax.model.effect_interface import Effect, State, Theta, complete
+from droid_jax.model.effect_interface import Effect, Theta, complete
 from droid_jax.model.effects.registry import ready
 from droid_jax.model.encoders import encoder_error
 from droid_jax.model.physics import Physics
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import gear_torques, simulate_step
 from droid_jax.policy.control import ACTIONS, OBSERVED, Safety, limited
 from droid_jax.policy.environment import Environment
 from droid_jax.runtime import first_device
 from droid_jax.simulate.batching import time_loop
+from droid_jax.simulate.effect_laws import Moving, compose, step_with_effects
 from droid_jax.simulate.hand_path import solve_pose
-from droid_jax.simulate.replay import (
-    apply_forces,
-    apply_friction,
-    changes_friction,
-    check_stateless,
-    compose,
-    servo_input,
-)
+from droid_jax.simulate.replay import check_stateless
 
 PAST = 4  # commands remembered: a delay of up to three times Task.control
 FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyond, the simulation has come apart
@@ -54,15 +47,10 @@ FAST = 100.0  # rad/s or m/s: ten times what arm, fingers and door ever do; beyo
 class World(NamedTuple):
     """What the simulation carries from one action to the next.
 
-    qpos [nq], qvel [nv], warm [nv] (solver's start), load [nv] and gear [2, nv] N m (as `State` has them); commands
-    [PAST, 9], the latest last; pads [2, 3] m in the knob's frame; time, held, longest: s.
+    commands: [PAST, 9], the latest last; pads [2, 3] m in the knob's frame; time, held, longest: s.
     """
 
-    qpos: jax.Array
-    qvel: jax.Array
-    warm: jax.Array
-    load: jax.Array
-    gear: jax.Array
+    moving: Moving
     commands: jax.Array
     pads: jax.Array
     time: jax.Array
@@ -111,13 +99,13 @@ class DoorEnv(Environment):
 
     def reset(self, rng: jax.Array) -> EnvState:
         """The start pose, each joint of the arm off by its own draw."""
-        scene, zero = self.scene, jnp.zeros(self.scene.model.nv, jnp.float32)
+        scene = self.scene
         off = self.task.spread * jax.random.normal(rng, (len(scene.joints),))
         qpos = jnp.asarray(self.start, jnp.float32).at[scene.joint_qpos].add(off)
         still = jnp.concatenate([qpos[scene.joint_qpos], jnp.full(2, OPEN, jnp.float32)])
         nothing = jnp.zeros(())
-        gear, commands = jnp.stack([zero, zero]), jnp.tile(still, (PAST, 1))
-        world = World(qpos, zero, zero, zero, gear, commands, jnp.zeros((2, 3)), nothing, nothing, nothing)
+        moving = Moving.at(qpos, jnp.zeros(scene.model.nv, jnp.float32))
+        world = World(moving, jnp.tile(still, (PAST, 1)), jnp.zeros((2, 3)), nothing, nothing, nothing)
         seen = self._look(self.sys.model, world, jnp.zeros(2))
         world = world._replace(pads=seen.pads)
         seen = seen._replace(sliding=nothing)
@@ -135,10 +123,11 @@ class DoorEnv(Environment):
         """
         carried: Any = state.pipeline_state
         before: World = carried
-        target = limited(self.interface, Safety(), before.qpos[self.scene.joint_qpos], action, jnp)
+        target = limited(self.interface, Safety(), before.moving.qpos[self.scene.joint_qpos], action, jnp)
         commands = jnp.concatenate([before.commands[1:], jnp.concatenate([target.arm, target.fingers])[None]])
         world, force = self._advance(self.sys, before._replace(commands=commands))
-        finite = jnp.all(jnp.isfinite(world.qpos)) & jnp.all(jnp.abs(world.qvel) < FAST) & jnp.all(jnp.isfinite(force))
+        finite = jnp.all(jnp.isfinite(world.moving.qpos)) & jnp.all(jnp.isfinite(force))
+        finite &= jnp.all(jnp.abs(world.moving.qvel) < FAST)
         world = jax.tree.map(lambda new, old: jnp.where(finite, new, old), world, before)
         force = jnp.where(finite, force, 0.0)
         seen = self._look(self.sys.model, world, force)
@@ -165,29 +154,28 @@ class DoorEnv(Environment):
 
         def substep(sample: Any, number: jax.Array, carry: Any) -> Any:
             model, theta, error, world = sample
-            qpos, qvel, warm, load, gear, _ = carry
-            now = State(world.time + number * self._timestep, qpos, qvel, load, model, gear=gear)
-            ctrl = self._servo(theta, now, world)
-            data = self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-            after = simulate_step(
-                apply_friction(model, theta, now, self.effects),
-                data,
+            moving, _ = carry
+            now = moving.state(world.time + number * self._timestep, model)
+            after, moving, _, _ = step_with_effects(
+                self._template,
+                model,
+                theta,
+                now,
+                moving,
+                self._command(theta, now.time, world),
+                self.effects,
+                error=error,
                 servo_damping=self._servo_damping,
-                push=apply_forces(theta, now, self.effects, error),
             )
-            force = finger_forces(self._hand, after)
-            gear = gear_torques(model, after, qvel) if changing else gear
-            return after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear, force
+            return moving, finger_forces(self._hand, after)
 
         model, theta = physics.model, complete(physics.theta, self.effects)
-        sample, changing = (model, theta, encoder_error(self.scene, model), world), changes_friction(self.effects)
-        start = (world.qpos, world.qvel, world.warm, world.load, world.gear, jnp.zeros(2))
-        qpos, qvel, warm, load, gear, force = time_loop(substep, sample, start, self._substeps)
-        now = world.time + self.task.control
-        return world._replace(qpos=qpos, qvel=qvel, warm=warm, load=load, gear=gear, time=now), force
+        sample = model, theta, encoder_error(self.scene, model), world
+        moving, force = time_loop(substep, sample, (world.moving, jnp.zeros(2)), self._substeps)
+        return world._replace(moving=moving, time=world.time + self.task.control), force
 
-    def _servo(self, theta: Theta, now: State, world: World) -> jax.Array:
-        """[9] what the servos are given: the latest command, or what effects make of the latest ones."""
+    def _command(self, theta: Theta, now: jax.Array, world: World) -> jax.Array:
+        """[9] the latest command, or what effects make of the latest ones."""
 
         def look(time: jax.Array) -> jax.Array:
             back = jnp.ceil((world.time - time) / self.task.control - 1e-6)
@@ -196,14 +184,14 @@ class DoorEnv(Environment):
         for effect in self.effects:
             if effect.command is not None and not effect.over_time:  # no recording runs, nor its clock
                 look = compose(effect.command, theta, look)
-        return servo_input(look(now.time), theta, now, self.effects)
+        return look(now)
 
     def _look(self, model, world: World, force: jax.Array):
-        data = mjx.kinematics(model, self._template.replace(qpos=world.qpos))
+        data = mjx.kinematics(model, self._template.replace(qpos=world.moving.qpos))
         return looked(self._hand, data, force, world.pads, self.task.control)
 
     def _observe(self, world: World, seen) -> jax.Array:
-        return observation(world.qpos[self.scene.joint_qpos], world.qvel[self.scene.joint_dofs], seen)
+        return observation(world.moving.qpos[self.scene.joint_qpos], world.moving.qvel[self.scene.joint_dofs], seen)
 
 
 def waiting_pose(scene: Scene, task: Task) -> np.ndarray:

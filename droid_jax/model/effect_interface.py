@@ -34,6 +34,8 @@ class State:
         pose: mjx.Data with the kinematics of qpos; None if they are not computed.
         gear: [2, nv] N m, at the time of `load`: torque of the motors on the gears (actuators and gravity compensation)
             and torque of the links on them (`step.gear_torques`); None if no effect changes dry friction.
+        motors: [3, nv] the state of gears (`Gear`): rad and rad/s by which the motors are ahead of their links, half a
+            step before, and the links' acceleration in the previous step, rad/s^2; None if no effect has a `gear`.
     """
 
     time: jax.Array
@@ -43,6 +45,7 @@ class State:
     model: Any = None
     pose: Any = None
     gear: Any = None
+    motors: Any = None
 
 
 @jax.tree_util.register_dataclass
@@ -71,6 +74,38 @@ class Rollout:
 
 
 @dataclass(frozen=True, eq=False)
+class GearStep:
+    """How motors drive their links through their gears in one time step.
+
+    Attributes:
+        model: mjx.Model with the inertia and the velocity gains of the motors that their links feel.
+        push: [nv] N m, torques of the gears on the links beyond those of the model's actuators.
+        after: link accelerations in the step [nv] -> `State.motors` of the next one.
+        reading: those -> [3, nv] what the motors' encoders read beyond the links, rad and rad/s, and what their torque
+            is beyond that of the model's actuators, N m.
+    """
+
+    model: Any
+    push: jax.Array
+    after: Callable[[jax.Array], jax.Array]
+    reading: Callable[[jax.Array], jax.Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Gear:
+    """The law of gears between motors and links.  A replay has one, which several effects may share.
+
+    Attributes:
+        step: (theta, State, servo's input [U]) -> GearStep.
+        start: (theta, State at rest, servo's input [U]) -> `State.motors` of motors that are at rest, and [nv] rad by
+            which their encoders read more than the positions of their links.
+    """
+
+    step: Callable[[Theta, State, jax.Array], GearStep]
+    start: Callable[[Theta, State, jax.Array], tuple[jax.Array, jax.Array]]
+
+
+@dataclass(frozen=True, eq=False)
 class Effect:
     """A physical effect beside the MuJoCo model, or a change of the model, that vanishes at neutral.
 
@@ -84,6 +119,7 @@ class Effect:
             coefficient, which other programs can do too; empty for another profile.
         command: (theta, time [], command_at) -> [U]; command_at(t) is the command at time t [s].
         servo: (theta, State, ctrl [U]) -> [U], the servo's input in place of the command.
+        gear: the gears between motors and links, in place of rigid ones.
         force: (theta, State) -> [nv] generalised force, added to qfrc_applied.
         frictionloss: (theta, State, base [nv]) -> [nv] N m, friction loss of the step.
         observe: (theta, Rollout) -> Rollout, the sensor model.
@@ -111,6 +147,7 @@ class Effect:
     profile_limits: str = ""
     command: Callable[[Theta, jax.Array, Callable], jax.Array] | None = None
     servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
+    gear: Gear | None = None
     force: Callable[[Theta, State], jax.Array] | None = None
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     observe: Callable[[Theta, Rollout], Rollout] | None = None
@@ -127,7 +164,7 @@ class Effect:
     over_time: bool = False
 
 
-LAWS = ("profile", "command", "servo", "force", "frictionloss", "observe", "native")  # fields that are functions
+LAWS = ("profile", "command", "servo", "gear", "force", "frictionloss", "observe", "native")  # fields with functions
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

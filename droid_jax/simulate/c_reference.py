@@ -21,9 +21,10 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument, simulate
+from droid_jax.simulate.effect_laws import profiled
 from droid_jax.simulate.initial_state import weight_share
 from droid_jax.simulate.inverse_dynamics import Path, PathTorques
-from droid_jax.simulate.replay import Drive, check_stateless, profiled
+from droid_jax.simulate.replay import Drive, check_stateless
 from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
 CHUNK = 64  # samples whose full states are in memory at once
@@ -99,7 +100,7 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         torque: the torque convention of the recording.
         effects: in the replay, without those of the torque offsets.
     """
-    functions = ("command", "servo", "force", "frictionloss", "observe")
+    functions = ("command", "servo", "gear", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
@@ -163,7 +164,7 @@ def c_path_torques(
 
 def why_no_path_in_c(space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
     """Why plain C cannot replay a measured motion; empty if it can.  The arguments are those of `why_not_in_c`."""
-    functions = ("command", "servo", "profile", "force", "frictionloss")
+    functions = ("command", "servo", "gear", "profile", "force", "frictionloss")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     if not torque.gravity and any(w.field == "qpos0" for p in space.parameters for w in p.writes):

@@ -23,8 +23,8 @@ from droid_jax.model.unsupported_features import refuse_fluid
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.runtime import first_device
 from droid_jax.simulate.closed_loops import coupled_to_others
+from droid_jax.simulate.effect_laws import apply_sensor_model
 from droid_jax.simulate.measured_motion import CUTOFF, Motion, measured_throughout
-from droid_jax.simulate.replay import apply_sensor_model
 
 
 def prescribed_joints(scene: Scene, recording: Recording, cutoff: float = CUTOFF) -> tuple[str, ...]:
@@ -157,7 +157,7 @@ def path_replay(
             fluid.
     """
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
-    steering = [e.name for e in effects if e.profile or e.command or e.servo]
+    steering = [e.name for e in effects if e.profile or e.command or e.servo or e.gear]
     if steering:
         raise ValueError(f"effects {', '.join(steering)} change commands, which a prescribed motion does not have")
     joints = joints or scene.joints

@@ -18,14 +18,14 @@ import numpy as np
 
 from droid_jax.arguments import lists_of_numbers
 from droid_jax.model.actuators import has_servo_damping
-from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
+from droid_jax.model.effect_interface import Effect, Rollout, Theta, column, complete
 from droid_jax.model.encoders import encoder_error, misplaced_compensation
 from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
 from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
 from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
-from droid_jax.model.step import gear_torques, servo_force, simulate_step
+from droid_jax.model.step import servo_force
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
@@ -33,6 +33,15 @@ from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSi
 from droid_jax.runtime import first_device
 from droid_jax.simulate.batching import time_loop
 from droid_jax.simulate.closed_loops import refuse_floating
+from droid_jax.simulate.effect_laws import (
+    Moving,
+    apply_sensor_model,
+    compose,
+    gear_of,
+    profiled,
+    servo_input,
+    step_with_effects,
+)
 from droid_jax.simulate.initial_state import (
     DEFAULT_START,
     StartConfig,
@@ -224,39 +233,37 @@ def servo_motion(
     shift = late if parity else 0.0  # steps by which commands are delayed and positions extrapolated
     half = late if parity else 0.5  # steps from the velocity before a step to the reported one
     damping = has_servo_damping(scene.model)
-    changing = changes_friction(effects)
 
     def step(sample: Any, k: jax.Array, carry: Any) -> Any:
         model, theta, error, table, origin = sample
-        (qpos, qvel, warm, load, gear), traces = carry
-        time = k * drive.timestep
-        state = State(time if origin is None else origin + time, qpos, qvel, load, model, gear=gear)
+        moving, traces = carry
+        time, qpos, qvel = k * drive.timestep, moving.qpos, moving.qvel
+        state = moving.state(time if origin is None else origin + time, model)
         row = k + earlier if earlier else k
-        ctrl = servo_input(_command(table, drive.timestep, row, shift, theta, effects), theta, state, effects)
-        before = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, ctrl=ctrl)
-        after = simulate_step(
-            apply_friction(model, theta, state, effects),
-            before,
-            parity=parity,
-            servo_damping=damping,
-            push=apply_forces(theta, state, effects, error),
+        command = _command(table, drive.timestep, row, shift, theta, effects)
+        after, following, used, gears = step_with_effects(
+            template, model, theta, state, moving, command, effects, error=error, parity=parity, servo_damping=damping
         )
         mean = 0.5 * (qvel + after.qvel)
-        servo = servo_force(model, after, mean) if damping and not parity else after.qfrc_actuator
-        torque = _joint_torque(model, before, after, servo, joints, drive, parity)
+        servo = servo_force(used, after, mean) if damping and not parity else after.qfrc_actuator
+        torque = _joint_torque(used, qvel, after, servo, joints, drive, parity)
+        read = None if gears is None else gears.reading(following.motors)[:, joints]
+        if read is not None and gears is not None:
+            torque = torque + (read[2] if drive.torque.side is TorqueSide.MOTOR else gears.push[joints])
         astray = misplaced_compensation(model, after, error)
         if astray is not None and drive.torque.gravity:  # such a torque contains the gravity compensation
             torque = torque + astray[joints]
+        position = qpos[positions] + shift * drive.timestep * qvel[joints]
+        velocity = (qvel + half * (after.qvel - qvel))[joints]
         now = (
             torque,
-            qpos[positions] + shift * drive.timestep * qvel[joints],
-            (qvel + half * (after.qvel - qvel))[joints],
+            position if read is None else position + read[0],
+            velocity if read is None else velocity + read[1],
             qpos[hinge] + shift * drive.timestep * qvel[hinge_speed] if hinge is not None else jnp.zeros(()),
             _touching(after, fingers),
         )
         traces = tuple(jax.lax.dynamic_update_index_in_dim(a, b, k, 0) for a, b in zip(traces, now, strict=True))
-        gear = gear_torques(model, after, qvel) if changing else gear
-        return (after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, gear), traces
+        return following, traces
 
     def motion(
         physics: Physics,
@@ -270,12 +277,16 @@ def servo_motion(
         model, theta, rows = with_gains(physics.model, gains), complete(physics.theta, effects), len(table) - earlier
         sent = profiled(table, drive.timestep, theta, effects)
         sample = model, theta, encoder_error(scene, model), sent, origin
-        zero, traces = jnp.zeros(scene.model.nv, jnp.float32), jnp.zeros((3, rows, len(joints)), jnp.float32)
+        moving = Moving.at(start, jnp.zeros(scene.model.nv, jnp.float32) if speed is None else speed)
+        if gear := gear_of(effects):
+            given = _command(sent, drive.timestep, jnp.int32(earlier), shift, theta, effects)
+            state = moving.state(jnp.float32(0.0) if origin is None else origin, model)
+            motors, ahead = gear.start(theta, state, servo_input(given, theta, state, effects))
+            # The recorded position is the motor's.
+            moving = moving._replace(motors=motors, qpos=start.at[positions].add(-ahead[joints]))
+        traces = jnp.zeros((3, rows, len(joints)), jnp.float32)
         angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)
-        first = (
-            (start, zero if speed is None else speed, zero, zero, jnp.stack([zero, zero])),
-            (*traces, angle, contact),
-        )
+        first = moving, (*traces, angle, contact)
         _, (torque, position, velocity, angle, contact) = time_loop(step, sample, first, steps)
         time = jnp.zeros(rows, jnp.float32)
         return Rollout(time, torque, position, velocity, angle, contact, jnp.array(True))
@@ -338,70 +349,6 @@ def _command(
     return at_time((k - delay) * timestep) if laws else ctrl
 
 
-def profiled(table: jax.Array, timestep: float, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
-    """[T, U] the command after the servos' profiles (`Effect.profile`)."""
-    for effect in effects:
-        if effect.profile is not None:
-            table = effect.profile(theta, table, timestep)
-    return table
-
-
-def compose(law: Callable, theta: Theta, command: Callable) -> Callable:
-    """The command t -> [U] after an effect's law."""
-    return lambda time: law(theta, time, command)
-
-
-def servo_input(ctrl: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]) -> jax.Array:
-    """[U] the input of the servos: the command changed by effects (`Effect.servo`)."""
-    for effect in effects:
-        if effect.servo is not None:
-            ctrl = effect.servo(theta, state, ctrl)
-    return ctrl
-
-
-def changes_friction(effects: Sequence[Effect]) -> bool:
-    """Whether an effect changes dry friction, which may depend on the torques of the gears."""
-    return any(effect.frictionloss is not None for effect in effects)
-
-
-def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect]):
-    """The model with the friction losses of effects in this state."""
-    loss = model.dof_frictionloss
-    for effect in effects:
-        if effect.frictionloss is not None:
-            loss = effect.frictionloss(theta, state, loss)
-    return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
-
-
-def apply_forces(
-    theta: Theta, state: State, effects: Sequence[Effect], error: jax.Array | None = None
-) -> Callable[[Any], jax.Array] | None:
-    """pose -> [nv] N m (N) of effects in this state and of gravity compensation at wrong positions; None if none acts.
-
-    error: [nv] joint position minus encoder reading, rad (m); None: 0.
-    """
-    laws = [effect.force for effect in effects if effect.force is not None]
-    if not laws and error is None:
-        return None
-
-    def forces(pose: Any) -> jax.Array:
-        at = replace(state, pose=pose)
-        astray = misplaced_compensation(state.model, pose, error)
-        return sum((law(theta, at) for law in laws), jnp.zeros_like(state.qvel) if astray is None else astray)
-
-    return forces
-
-
-def apply_sensor_model(rollout: Rollout, theta: Theta, effects: Sequence[Effect]) -> Rollout:
-    """The rollout after the sensor effects (`Effect.observe`), with `finite`."""
-    for effect in effects:
-        if effect.observe is not None:
-            rollout = effect.observe(theta, rollout)
-    traces = (rollout.torque, rollout.position, rollout.velocity, rollout.object_angle)
-    finite = [jnp.all(jnp.isfinite(trace)) for trace in traces]
-    return replace(rollout, finite=jnp.all(jnp.stack(finite)))
-
-
 def torque_offset_effect(joints: Sequence[str]) -> Effect:
     """The effect of constant torque-sensor errors, `torque_offset[joint]` of theta, N m; 0 if theta lacks it."""
 
@@ -411,17 +358,19 @@ def torque_offset_effect(joints: Sequence[str]) -> Effect:
     return Effect(TORQUE_OFFSETS, observe=observe)
 
 
-def _joint_torque(model, before, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool) -> jax.Array:
+def _joint_torque(
+    model, before: jax.Array, after, servo: jax.Array, joints: np.ndarray, drive: Drive, parity: bool
+) -> jax.Array:
     """[J] N m, torque on the side of the drive's convention: the motor's, or the one that reaches the link.
 
     The link side excludes rotor inertia (armature) and the damping and dry friction of the joint, as the step
     integrated them: with the velocity's difference over the step, and its mean (in the C engine its end).
 
-    servo: [nv] N m, the actuators' forces in the step.
+    before: [nv] velocity before the step.  servo: [nv] N m, the actuators' forces in it.
     """
     torque = servo[joints]
     if drive.torque.side is TorqueSide.LINK:
-        gain = (after.qvel - before.qvel)[joints]
+        gain = (after.qvel - before)[joints]
         velocity = after.qvel[joints] - (0.0 if parity else 0.5) * gain
         torque = torque - model.dof_armature[joints] * gain / drive.timestep - model.dof_damping[joints] * velocity
         rows = constraint_rows(after)

@@ -1,8 +1,8 @@
 """Record the synthetic robot with hidden effects, for blind tests of the search for missing effects.
 
 Their formulas, constants and time step are independent of the library of effects that the search uses.  A recording
-does not say what was hidden.  The formulas are in `hinge_effects`, `friction_effects`, `arm_effects`, `base_effects`
-and `signal_effects`.
+does not say what was hidden.  The formulas are in `hinge_effects`, `friction_effects`, `arm_effects`, `drive_effects`,
+`base_effects` and `signal_effects`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from droid_jax.report.text import listed as enumerated
 from droid_jax.simulate.c_engine import split
 from droid_jax.synthetic.arm_effects import ARM_EFFECTS
 from droid_jax.synthetic.base_effects import BASE
+from droid_jax.synthetic.drive_effects import DRIVES
 from droid_jax.synthetic.friction_effects import FRICTION
 from droid_jax.synthetic.hinge_effects import DOOR
 from droid_jax.synthetic.hooks import Hidden, Influence, Place, SensorInput, edited, step_through
 from droid_jax.synthetic.robot import SyntheticRobot, SyntheticRobotConfig, as_recording, sensor_torque, set_up
 from droid_jax.synthetic.signal_effects import SIGNALS
 
-HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *BASE, *SIGNALS)}
+HIDDEN: dict[str, Hidden] = {h.name: h for h in (*DOOR, *FRICTION, *ARM_EFFECTS, *DRIVES, *BASE, *SIGNALS)}
 # Hidden effect -> the corresponding effect of the library; effects that are missing here have none.  The formulas
 # differ, except for a tilted base and an encoder's zero, which have one form only and are computed in another way.
 LIBRARY = {
@@ -57,6 +58,9 @@ LIBRARY = {
     "cable_pull": "cable_pull",
     "torque_ripple": "torque_ripple",
     "joint_elasticity": "joint_compliance",
+    "resonance": "two_mass_resonance",
+    "free_play": "two_mass_backlash",
+    "torque_line": "torque_speed_line",
     "servo_gains": "servo_gain",
     "grip_compliance": "contact_compliance",
     "tilted_base": "gravity_direction",
@@ -212,9 +216,15 @@ def _joints(effect: Hidden, scene: Scene) -> tuple[str, ...]:
     return ()
 
 
-def influences_of(scene: Scene, applied: Sequence[Applied], repeat: int = 0, period: float = 0.0) -> list[Influence]:
-    """The effects in one repeat, each with a new state; repeat and period as in `Place`."""
-    places = [Place(scene, (one.joint,) if one.joint else scene.joints, repeat, period) for one in applied]
+def influences_of(
+    scene: Scene,
+    applied: Sequence[Applied],
+    repeat: int = 0,
+    period: float = 0.0,
+    side: TorqueSide = TorqueSide.MOTOR,
+) -> list[Influence]:
+    """The effects in one repeat, each with a new state; the other arguments are those of `Place`."""
+    places = [Place(scene, (one.joint,) if one.joint else scene.joints, repeat, period, side) for one in applied]
     return [HIDDEN[one.name].make(place, one.amplitude) for one, place in zip(applied, places, strict=True)]
 
 
@@ -230,9 +240,10 @@ def _simulate(
     count = len(synthetic_robot.models)
     since = synthetic_robot.clock - synthetic_robot.clock[0]
     period = float(since[-1]) + PAUSE
-    effects = [influences_of(synthetic_robot.scene, applied, repeat, period) for repeat in range(count)]
+    side = synthetic_robot.config.side
+    effects = [influences_of(synthetic_robot.scene, applied, repeat, period, side) for repeat in range(count)]
     models = [edited(model, influences) for model, influences in zip(synthetic_robot.models, effects, strict=True)]
-    link = synthetic_robot.config.side is TorqueSide.LINK
+    link = side is TorqueSide.LINK
     gears = np.zeros((count, len(synthetic_robot.clock) if link else 0, synthetic_robot.scene.model.nv))
 
     def one(repeat: int) -> np.ndarray:

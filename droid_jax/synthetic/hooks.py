@@ -17,6 +17,7 @@ import scipy.signal
 
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
+from droid_jax.recordings.recording import TorqueSide
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +29,14 @@ class Place:
         joints: on which a joint effect acts.
         repeat: number, from 0.
         period: s from the start of a repeat to the start of the next, including the pause.
+        side: of the torque sensors.
     """
 
     scene: Scene
     joints: tuple[str, ...]
     repeat: int = 0
     period: float = 0.0
+    side: TorqueSide = TorqueSide.MOTOR
 
     @functools.cached_property
     def dofs(self) -> np.ndarray:

@@ -86,12 +86,22 @@ ANSWERS: dict[str, Answer] = {
     "backlash": Answer(
         "", why="a play that the command leads; joint_backlash follows the load and explains none of it", scenes=SERVO
     ),
+    "resonance": Answer(
+        "two_mass_resonance", ("joint_compliance", "servo_gain"), "a slow motion leaves the gear's twist alone", SERVO
+    ),
+    "free_play": Answer(
+        "two_mass_backlash", ("joint_backlash",), "a motor that crosses the gap at once has no state", SERVO
+    ),
+    "torque_line": Answer("torque_speed_line", scenes=SERVO),
     "servo_gains": Answer(
         "servo_gain", ("joint_compliance",), "a lower gain is exactly an elastic gear's", SERVO
     ),
     "grip_compliance": Answer("contact_compliance"),
     "firm_friction": Answer("soft_friction", scenes=("bench",), why="only the elbow there has friction of its own"),
-    "tilted_base": Answer("gravity_direction", scenes=("bench", "arm", "door")),
+    "tilted_base": Answer(
+        "gravity_direction", ("encoder_offset",), "of one joint alone a lean in its plane is an offset of its encoder",
+        ("bench", "arm", "door"),
+    ),
     "encoder_zero": Answer(
         "encoder_offset", ("gravity_direction",), "of links in one plane a lean is an offset of the first joint",
         ("bench", "arm", "door"),
@@ -115,7 +125,8 @@ ANSWERS: dict[str, Answer] = {
     "torque_drift": Answer("torque_drift", ("torque_bias",), "it warms up mostly between the repeats"),
 }  # fmt: skip
 NO_HINGE = ("cable_pull", "torque_ripple", "dry_friction", "bristle_friction", "warm_up_friction", "load_friction",
-            "mesh_friction", "joint_elasticity", "backlash", "servo_gains", "firm_friction",
+            "mesh_friction", "joint_elasticity", "backlash", "resonance", "free_play", "torque_line", "servo_gains",
+            "firm_friction",
             "encoder_zero", "crosstalk", "feedforward", "inner_profile")  # fmt: skip
 PLACES = {"command_delay": "commands", "clock_rate": "commands", "sensor_delay": "sensors",
           "contact_compliance": "grip", "gravity_direction": "base"}  # fmt: skip
@@ -205,7 +216,8 @@ def _at(scene: Scene, name: str, joint: str) -> str:
         return f"{name} at {scene.joints[-1]}"
     if name in OF_HINGE:
         return f"{name} at {scene.object_joint}" if on_hinge else ""
-    place = joint or scene.object_joint
+    alone = scene.joints[0] if len(scene.joints) == 1 else None
+    place = joint or scene.object_joint or alone
     return f"{name} at {place}" if place in scene.joints and (not on_hinge or name not in NO_HINGE) else ""
 
 

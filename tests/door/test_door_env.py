@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -46,12 +45,12 @@ def rolled(env: DoorEnv, script: np.ndarray) -> Callable[[State], dict[str, np.n
     """
 
     def act(state, target):
-        position = state.pipeline_state.qpos[env.scene.joint_qpos]
+        position = state.pipeline_state.moving.qpos[env.scene.joint_qpos]
         action = jax.numpy.concatenate([(target[:7] - position) / TASK.reach, 2 * target[7:] / TASK.width - 1])
         state = env.step(state, action)
         world, metrics = state.pipeline_state, state.metrics
         told = {name: metrics[name] for name in ("angle", "grip", "blown_up")}
-        return state, {**told, "qpos": world.qpos, "obs": state.obs, "reward": state.reward, "done": state.done}
+        return state, {**told, "qpos": world.moving.qpos, "obs": state.obs, "reward": state.reward, "done": state.done}
 
     def roll(start):
         return jax.lax.scan(act, start, np.asarray(script, np.float32))[1]
@@ -82,7 +81,7 @@ def in_c(env: DoorEnv, script: np.ndarray, start: State) -> dict[str, np.ndarray
     scene = door_scene(timestep=0.0005, limits=True)
     model, hand = scene.model, hand_of(scene)
     data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(start.pipeline_state.qpos)
+    data.qpos[:] = np.asarray(start.pipeline_state.moving.qpos)
     out, last = {"angle": [], "force": [], "yaw": [], "pads": []}, np.zeros((2, 3))
     for target in script:
         position = data.qpos[scene.joint_qpos]
@@ -132,9 +131,10 @@ def test_a_simulation_that_comes_apart_ends_the_episode_and_is_counted(rolled, s
     """Also where it is still a number: one such observation would spoil the normalisation of all."""
     assert not trained_on["done"].any() and not trained_on["blown_up"].any()
     world: Any = start.pipeline_state
-    found = rolled(start.replace(pipeline_state=world._replace(qvel=world.qvel.at[2].set(speed))))  # pyright: ignore
+    moving = world.moving._replace(qvel=world.moving.qvel.at[2].set(speed))
+    found = rolled(start.replace(pipeline_state=world._replace(moving=moving)))  # pyright: ignore
     assert (found["done"][0], found["blown_up"][0], found["reward"][0]) == (1.0, 1.0, 0.0)
-    np.testing.assert_array_equal(found["qpos"][0], world.qpos)
+    np.testing.assert_array_equal(found["qpos"][0], world.moving.qpos)
 
 
 @pytest.mark.slow
@@ -152,7 +152,7 @@ def test_effects_of_an_extended_model_act_here_too(env: DoorEnv):
             env.sys = Physics(env.scene.mjx, values)
             first = env.reset(jax.random.key(0))
             state = env.step(env.step(first, jax.numpy.ones(9)), jax.numpy.ones(9))
-            return state.pipeline_state.qpos - first.pipeline_state.qpos
+            return state.pipeline_state.moving.qpos - first.pipeline_state.moving.qpos
 
         before = env.sys
         try:
@@ -173,9 +173,8 @@ def test_the_clock_of_a_recording_is_not_the_control_loops(env: DoorEnv):
     extended = DoorEnv(env.scene, TASK, library(env.scene, ("clock_rate",)))
     number, commands = jax.numpy.float32, jax.numpy.arange(PAST)[:, None] * jax.numpy.ones(9)
     nothing: Any = None  # that this does not read
-    world = World(*5 * (nothing,), commands, nothing, number(9.0), nothing, nothing)
-    now: Any = SimpleNamespace(time=world.time)
-    np.testing.assert_array_equal(extended._servo({"clock_rate": number(-0.01)}, now, world), commands[-1])
+    world = World(nothing, commands, nothing, number(9.0), nothing, nothing)
+    np.testing.assert_array_equal(extended._command({"clock_rate": number(-0.01)}, world.time, world), commands[-1])
 
 
 def test_a_time_step_that_does_not_fit_is_refused():

@@ -26,9 +26,9 @@ from droid_jax.model.scene import Scene, compile_scene, with_options
 from droid_jax.recordings.recording import Channel, ServoGains, TorqueConvention, TorqueSide
 from droid_jax.simulate.batching import over_population
 from droid_jax.simulate.c_reference import c_replay
+from droid_jax.simulate.effect_laws import apply_sensor_model
 from droid_jax.simulate.replay import (
     Drive,
-    apply_sensor_model,
     make_drive,
     servo_replay,
     torque_offset_effect,

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+
+import mujoco
+import numpy as np
 
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.parameters import Parameter
@@ -10,6 +14,36 @@ from droid_jax.model.scene import Scene
 
 TORQUE = "N m"
 LENGTHS = (("(N m)", "N"), (TORQUE, "N"), ("rad", "m"), ("turn", "(2 pi m)"))  # units at hinges -> at slides
+
+PANDA = 54.0  # N m, the largest of a Panda's `usual_torques`
+FINEST = 2  # steps of a scale in a decade
+POSES = 20  # in which a joint's weight is computed
+AT_MOST = 1.0  # rad (m) from the model's own pose, in these poses
+USUAL_ACCELERATION = 5.0  # rad/s^2 (m/s^2), of motions that are recorded
+
+
+def usual_torques(scene: Scene, joints: Sequence[str]) -> np.ndarray:
+    """[J] N m (N) that usual motions of these joints take, without friction: weight and inertia."""
+    model, rng, dofs = scene.model, np.random.default_rng(0), [scene.dof(j) for j in joints]
+    data, inertia, most = mujoco.MjData(model), np.empty((model.nv, model.nv)), np.zeros(len(dofs))
+    for _ in range(POSES):
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, rng.uniform(-AT_MOST, AT_MOST, model.nv), 1.0)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        most = np.maximum(most, (np.abs(data.qfrc_bias) + USUAL_ACCELERATION * np.diagonal(inertia))[dofs])
+    return most
+
+
+def scale_of(largest: float) -> float:
+    """The scale of the library for a machine whose largest torque this is, N m (N): 1 for one like a Panda.
+
+    In half decades (0.1, 0.3, 1, 3), rounded towards 1, so that it does not depend on details of a model or a log.
+    """
+    if largest <= 0.0:
+        return 1.0
+    steps = int(FINEST * np.log10(largest / PANDA))
+    return float(f"{10.0 ** (steps / FINEST):.1g}")
 
 
 def sized(effect: Effect, scene: Scene, scale: float) -> Effect:

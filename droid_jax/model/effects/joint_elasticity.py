@@ -10,84 +10,19 @@ step would be simpler, but with a stiff servo this is a loop with a gain above o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
-from droid_jax.model.effect_interface import Effect, State, column
+from droid_jax.model.effect_interface import Effect, column
 from droid_jax.model.effects import coefficients as a
+from droid_jax.model.effects.position_servos import arm_servos
 from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
 LEAST = 0.2  # lower limit of 1 + k c, since a fitted servo may be stiffer than the one from which bounds are computed
 COMPLIANCE, BACKLASH = "joint_compliance", "joint_backlash"
-
-
-@dataclass(frozen=True, eq=False)
-class _Servos:
-    """The arm's joints with a position servo.
-
-    Attributes:
-        joints: J names.
-        actuators: [J] ids.
-        positions, dofs: [J] position and velocity addresses.
-        gear: [J] transmission ratio.
-        stiffness: [J] N m/rad at the joint, of the MJCF.
-    """
-
-    joints: tuple[str, ...]
-    actuators: np.ndarray
-    positions: np.ndarray
-    dofs: np.ndarray
-    gear: np.ndarray
-    stiffness: np.ndarray
-
-    def rigid_torque(self, state: State, ctrl: jax.Array) -> jax.Array:
-        """[J] N m, servo torque with motors at the positions of their links."""
-        gain, bias = self._law(state)
-        length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
-        feedback = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
-        return jnp.asarray(self.gear) * (gain * ctrl[self.actuators] + feedback)
-
-    def stiffness_in(self, state: State) -> jax.Array:
-        """[J] N m/rad at the joint, of the sample's model."""
-        return -self._law(state)[1][:, 1] * self.gear**2
-
-    def with_lead(self, state: State, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
-        """[U] the command with the same effect as motors that are ahead of their links by lead [J] rad."""
-        gain, _ = self._law(state)
-        return ctrl.at[self.actuators].add(-self.stiffness_in(state) * lead / (self.gear * gain))
-
-    def _law(self, state: State) -> tuple[jax.Array, jax.Array]:
-        """Gain [J] and bias [J, 3] of the actuators."""
-        gain, bias = state.model.actuator_gainprm, state.model.actuator_biasprm
-        return gain[self.actuators, 0], bias[self.actuators, :3]
-
-
-def _servos(scene: Scene) -> _Servos | None:
-    """The arm's joints with a position servo; None if there are none, since other motors do not use their position."""
-    model = scene.model
-    fixed = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
-    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    gear = model.actuator_gear[:, 0]
-    stiffness = np.where(fixed & affine & (model.actuator_gainprm[:, 0] != 0), -model.actuator_biasprm[:, 1], 0.0)
-    stiffness = stiffness * gear**2
-    row = {j: scene.command_names.index(j) for j in a.arm(scene) if j in scene.command_names}
-    joints = tuple(j for j, u in row.items() if stiffness[u] > 0)
-    if not joints:
-        return None
-    actuators = np.array([row[j] for j in joints], dtype=int)
-    return _Servos(
-        joints=joints,
-        actuators=actuators,
-        positions=np.array([scene.qpos(j) for j in joints], dtype=int),
-        dofs=np.array([scene.dof(j) for j in joints], dtype=int),
-        gear=gear[actuators],
-        stiffness=stiffness[actuators],
-    )
 
 
 @register
@@ -96,7 +31,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
 
     The data constrain c relative to the servo's 1 / k: with a soft servo only a softer gear is identifiable.
     """
-    servos = _servos(scene)
+    servos = arm_servos(scene)
     if servos is None:
         return None
 
@@ -140,7 +75,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
 @register
 def joint_backlash(scene: Scene) -> Effect | None:
     """The motor is ahead of the link by half the backlash, rad, in the direction of the torque, if there is any."""
-    servos = _servos(scene)
+    servos = arm_servos(scene)
     if servos is None:
         return None
 

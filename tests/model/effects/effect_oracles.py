@@ -22,6 +22,10 @@ CARRIED = 1.1 * 0.3  # kg m about the shoulder, of their mass at the elbow
 UPPER_ARM = 1.5 * 0.15 + CARRIED
 
 
+STIFFNESS = {"shoulder": 80.0, "elbow": 40.0}  # N m/rad
+OF_THEIR_OWN = ("two_mass_backlash", "two_mass_resonance")  # effects with a state: see test_two_masses.py
+
+
 @dataclass(frozen=True)
 class Now:
     """One moment: each joint's angle, speed, actuator torque before, and how far its command is ahead of it.
@@ -245,6 +249,12 @@ def stretch(joint: str, now: Now) -> float:
     return now.q[joint] - (ELBOW_REFERENCE if joint == "elbow" else 0.0)
 
 
+def at_most(v: Values, joint: str, now: Now) -> float:
+    """N m that a motor at its full voltage gives of what its servo asks for; v without the joint's name."""
+    stall, fall = 1.0 / v["torque_speed_line"], v["torque_speed_slope"] * now.w[joint]
+    return float(np.clip(STIFFNESS[joint] * now.ahead[joint], -stall * (1.0 + fall), stall * (1.0 - fall)))
+
+
 ORACLES = {
     "angle_friction": Oracle(  # below zero in the middle
         {"angle_friction_slope": -1.5, "angle_friction_curve": 1.8},
@@ -354,6 +364,10 @@ ORACLES = {
                 + v["ripple_cosine"] * np.cos(v["ripple_periods"] * now.q[j])
             )
         ),
+    ),
+    "torque_speed_line": Oracle(
+        {**each(*ARM, torque_speed_line=(0.4, 0.8)), "torque_speed_slope": 0.3},
+        lead=at_arm(lambda v, j, now: now.ahead[j] - at_most(v, j, now) / STIFFNESS[j]),
     ),
     "velocity_feedforward": Oracle(each(*ARM, velocity_feedforward=(0.03, -0.02)), sent=feedforward),
 }

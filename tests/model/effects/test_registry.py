@@ -27,8 +27,9 @@ OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge
 OF_ARMS = {"cable_pull", "encoder_offset", "free_payload", "gear_friction", "gravity_direction", "joint_backlash",
            "joint_compliance", "joint_coulomb", "joint_directional", "joint_stribeck", "load_friction", "payload",
            "profile_acceleration", "profile_speed", "servo_gain", "soft_friction", "torque_crosstalk",
-           "torque_ripple", "velocity_feedforward"}  # fmt: skip
-OF_SERVOS = {"joint_backlash", "joint_compliance"}
+           "torque_ripple", "torque_speed_line", "two_mass_backlash", "two_mass_resonance",
+           "velocity_feedforward"}  # fmt: skip
+OF_SERVOS = {"joint_backlash", "joint_compliance", "torque_speed_line", "two_mass_backlash", "two_mass_resonance"}
 OF_GRIPS = {"contact_compliance"}
 
 
@@ -133,9 +134,16 @@ def test_motors_have_no_elasticity():
     """Their torque is the command, whatever their position is."""
     motors = edited('"s" joint="shoulder" kp="80"', '"s" joint="shoulder" kp="0"')
     compliant = library(motors, sorted(OF_SERVOS))
-    assert [list(e.locations) for e in compliant] == [["elbow"], ["elbow"]]
+    assert [list(e.locations) for e in compliant] == [["elbow"]] * len(OF_SERVOS)
     for effect in compliant:
-        assert [p.name for p in effect.parameters] == [f"{effect.name}[elbow]"]
+        of_joints = [p.name for p in effect.parameters if p.name not in effect.shape_parameters]
+        assert of_joints == [f"{effect.name}[elbow]"]
+
+
+def test_a_joint_without_armature_has_no_motor_of_its_own():
+    light = edited('armature="0.02"', "")
+    for effect in library(light, ["two_mass_backlash", "two_mass_resonance"]):
+        assert list(effect.locations) == ["shoulder"]
 
 
 def test_joints_without_servos_have_no_servo_effects():
@@ -227,7 +235,7 @@ def test_a_taken_name_is_refused(own_list: None):
     def drag(scene: Scene) -> Effect | None:
         return None
 
-    with pytest.raises(ValueError, match=r"'drag' is registered already, by droid_jax\.model\.effects\.drag"):
+    with pytest.raises(ValueError, match=r"'drag' is registered already, by droid_jax\.model\.effects\.hinge_dampers"):
         register(drag)
     assert [e.name for e in library(mechanism(), ["drag"])] == ["drag"]
 

@@ -1,0 +1,197 @@
+"""Motor and link as two masses: an elastic gear that vibrates, and backlash in which both move freely.
+
+With the motor's angle theta, the link's q, the gear's torque F and the motor's inertia J (the joint's armature):
+
+    J theta'' = servo(theta) - F        M q'' = F + all else        F = (d - o) / c + D d'     d = theta - q
+
+d is the lead of the motor, o the nearer end of the backlash, c the compliance of the gear and D its damping.  F is zero
+inside the backlash.  Damping and dry friction of the joint act on the link.
+
+In a time step the motor's equation is solved exactly for a constant link acceleration.  Its solution is linear in that
+acceleration, so that the gear's mean torque is a constant minus a share of J q''.  The link then moves with that share
+of the armature in one solve with everything else, and the step is stable at any stiffness.  As the compliance vanishes
+the share is one, and the replay is that of a rigid gear.  A rigid gear that meets the end of its backlash does not
+rebound: momentum is conserved, and the two move together until the torque on the contact changes its sign.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from droid_jax.model.effect_interface import Effect, Gear, GearStep, State, Theta, column
+from droid_jax.model.effects import coefficients as a
+from droid_jax.model.effects.position_servos import PositionServos, arm_servos
+from droid_jax.model.effects.registry import register
+from droid_jax.model.scene import Scene
+
+RESONANCE, BACKLASH, DAMPING = "two_mass_resonance", "two_mass_backlash", "two_mass_damping"
+DAMPING_RATIOS = (0.02, 0.1)  # of a motor on its gear, held at the other side
+LEAST_COMPLIANCE = 1e-9  # rad/(N m), at and below which a gear is rigid
+LEAST_INERTIA = 1e-9  # kg m^2
+
+
+@register
+def two_mass_resonance(scene: Scene) -> Effect | None:
+    """A motor with the joint's armature on a gear of compliance c, rad/(N m); the servo's encoder is on the motor."""
+    servos = _geared(scene)
+    if servos is None:
+        return None
+    usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
+    of_joints = (
+        a.coefficient(f"{RESONANCE}[{j}]", "rad/(N m)", usual[j], max(1e-3, 0.3 / float(k)), low=0.0)
+        for j, k in zip(servos.joints, servos.stiffness, strict=True)
+    )
+    return Effect(
+        RESONANCE,
+        (*of_joints, a.shape(DAMPING, "-", DAMPING_RATIOS, 0.0, 1.0)),
+        gear=_gear(scene),
+        description="an elastic gear on which the motor and the link vibrate against each other",
+        signature="vibration of that joint after fast changes, and a tracking error in proportion to load",
+        confused_with=("joint_compliance", "servo_gain", "profile_acceleration"),
+        special_cases=("joint_compliance",),
+        locations=a.locations(servos.joints, RESONANCE),
+        shape_parameters={DAMPING: DAMPING_RATIOS},
+        minimum_size=0.2 * min(usual.values()),
+    )
+
+
+@register
+def two_mass_backlash(scene: Scene) -> Effect | None:
+    """A motor that turns freely over b rad, half of it to either side of the link, whose position is recorded."""
+    servos = _geared(scene)
+    if servos is None:
+        return None
+    return Effect(
+        BACKLASH,
+        a.of_joints(BACKLASH, servos.joints, "rad", 4e-3, 5e-2, low=0.0),
+        gear=_gear(scene),
+        description="backlash in a joint's gear, which the motor and the link cross on their own",
+        signature="where the load of that joint changes sign: a jump, a short impact, or small oscillations at rest",
+        confused_with=("joint_backlash", "joint_coulomb", "joint_compliance"),
+        special_cases=("joint_backlash",),
+        locations=a.locations(servos.joints, BACKLASH),
+        minimum_size=1e-3,
+    )
+
+
+def _geared(scene: Scene) -> PositionServos | None:
+    """The position servos of joints with an armature, which is the inertia of the motor; None if there are none."""
+    servos = arm_servos(scene)
+    return None if servos is None else servos.where(scene.model.dof_armature[servos.dofs] > 0.0)
+
+
+@functools.lru_cache(maxsize=64)
+def _gear(scene: Scene) -> Gear:
+    """The law that both effects share, so that they act in one model."""
+    servos = _geared(scene)
+    assert servos is not None
+
+    def step(theta: Theta, state: State, ctrl: jax.Array) -> GearStep:
+        return _step(servos, theta, state, ctrl)
+
+    def start(theta: Theta, state: State, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
+        compliance, half, _ = _of(servos, theta)
+        # qpos is what was recorded: the link's position and the twist of the gear.
+        stiffness, torque = servos.stiffness_in(state), servos.rigid_torque(state, ctrl)
+        free = torque / stiffness  # the lead at which the servo is at its goal
+        elastic = compliance * (torque - stiffness * jnp.sign(torque) * half)
+        inside = jnp.abs(free) < half
+        elastic = jnp.where(inside, 0.0, elastic)
+        lead = jnp.where(inside, free, jnp.sign(torque) * half + elastic)
+        none = jnp.zeros((3, len(state.qvel)), jnp.float32)
+        return none.at[0, servos.dofs].set(lead), none[0].at[servos.dofs].set(elastic)
+
+    return Gear(step, start)
+
+
+def _of(servos: PositionServos, theta: Theta) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Compliance [J] rad/(N m), half of the backlash [J] rad, and damping ratio []."""
+    compliance, backlash = column(theta, RESONANCE, servos.joints), column(theta, BACKLASH, servos.joints)
+    return jnp.abs(compliance), 0.5 * jnp.abs(backlash), a.value(theta, DAMPING, DAMPING_RATIOS[0])
+
+
+def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -> GearStep:
+    """One time step of the motors; see the module's text for the equations."""
+    model, dofs, actuators = state.model, servos.dofs, servos.actuators
+    lead, speed, acceleration = state.motors[:, dofs]
+    compliance, half, ratio = _of(servos, theta)
+    timestep = model.opt.timestep
+    inertia = jnp.maximum(model.dof_armature[dofs], LEAST_INERTIA)
+    stiffness, damping = servos.stiffness_in(state), servos.damping_in(state)
+    rigid = servos.rigid_torque(state, ctrl)
+    # A servo at its limit gives that limit: the constant part of its law is what makes it so amid the step.
+    own_lead = stiffness * (lead + 0.5 * timestep * speed) + damping * speed
+    now, (low, high) = rigid - own_lead, servos.limits_in(state)
+    torque = jnp.where((now > low) & (now < high), rigid, jnp.clip(now, low, high) + own_lead)
+
+    # Contact or free.  A rigid contact lasts while the motor, left alone, would go further.
+    is_rigid = compliance <= LEAST_COMPLIANCE
+    alone = (torque - stiffness * lead - damping * speed) / inertia - acceleration
+    coming = jnp.where(is_rigid, lead + timestep * speed + 0.5 * timestep**2 * alone, lead)
+    free = jnp.abs(coming) < half
+    end = jnp.where(free, 0.0, jnp.sign(coming) * half)
+    hard, soft = is_rigid & ~free, ~is_rigid & ~free
+    spring = jnp.where(soft, 1.0 / jnp.maximum(compliance, LEAST_COMPLIANCE), 0.0)
+    damper = 2.0 * ratio * jnp.sqrt(inertia * spring)
+
+    # J x'' + (k_v + D) x' + (k_p + 1 / c) x = B - J' q'', x = d - o; the servo damps with the step's mean velocity.
+    total, decay = stiffness + spring, (damping + damper) / (2.0 * inertia)
+    omega2 = total / inertia
+    cosine, sine = _decaying(decay, omega2, timestep)
+
+    def flow(y: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Without B: displacement and speed after the step, and the displacement's mean in it."""
+        after = (cosine + decay * sine) * y + sine * v
+        faster = (cosine - decay * sine) * v - omega2 * sine * y
+        return after, faster, -((faster - v) + 2.0 * decay * (after - y)) / (omega2 * timestep)
+
+    y = lead - end
+    y_after, v_after, y_mean = flow(y, speed)
+    u_after, w_after, u_mean = flow(-1.0 / total, jnp.zeros_like(y))
+    u_after, u_mean = u_after + 1.0 / total, u_mean + 1.0 / total  # from rest at x = 0, of a constant B of 1 N m
+    share = jnp.where(hard, 1.0, spring * u_mean + damper * u_after / timestep)
+    own = jnp.where(hard, inertia * speed / timestep, spring * y_mean + damper * (y_after - y) / timestep)
+
+    constant = torque - stiffness * end
+    actuators_give = jnp.clip(rigid + (1.0 - share) * damping * state.qvel[dofs], low, high)
+    push = own + share * constant - actuators_give
+    bias = model.actuator_biasprm
+    geared = model.replace(
+        dof_armature=model.dof_armature.at[dofs].multiply(share),
+        actuator_biasprm=bias.at[actuators, 2].multiply(share),
+    )
+
+    def after(qacc: jax.Array) -> jax.Array:
+        drive = constant - (inertia + 0.5 * timestep * damping) * qacc[dofs]
+        moved = jnp.where(hard, end, end + y_after + drive * u_after)
+        faster = jnp.where(hard, 0.0, v_after + drive * w_after)
+        # The acceleration of an impact ends with it and does not tell whether the contact lasts; that before it does.
+        lasting = jnp.where(hard & (speed != 0.0), acceleration, qacc[dofs])
+        return state.motors.at[:, dofs].set(jnp.stack([moved, faster, lasting]))
+
+    def reading(motors: jax.Array) -> jax.Array:
+        later, faster, qacc = motors[:, dofs]
+        middle = 0.5 * (lead + later)  # at the time of the position, half a step after `lead`
+        elastic = middle - jnp.clip(middle, -half, half)
+        quicker = jnp.where(soft, 0.5 * (speed + faster), 0.0)
+        torque = push + (1.0 - share) * inertia * qacc + inertia * (faster - speed) / timestep
+        return jnp.zeros_like(motors).at[:, dofs].set(jnp.stack([elastic, quicker, torque]))
+
+    return GearStep(geared, jnp.zeros_like(state.qvel).at[dofs].set(push), after, reading)
+
+
+def _decaying(decay: jax.Array, omega2: jax.Array, time: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """exp(-decay t) cos(w t) and exp(-decay t) sin(w t) / w, w^2 = omega2 - decay^2; hyperbolic below zero."""
+    square = omega2 - decay**2
+    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
+    envelope = jnp.exp(-decay * time)
+    slow, fast = jnp.exp((root - decay) * time), jnp.exp(-(root + decay) * time)
+    over = square < 0.0
+    # decay >= root if overdamped, so that neither exponential grows.
+    slow = jnp.where(over, slow, 0.0)
+    cosine = jnp.where(over, 0.5 * (slow + fast), envelope * jnp.cos(root * time))
+    sine = jnp.where(over, 0.5 * (slow - fast), envelope * jnp.sin(root * time)) / root
+    return cosine, sine
