@@ -151,13 +151,13 @@ def hide_torque_line(place: Place, a: float) -> Influence:
             gain, bias, ratio = model.actuator_gainprm[u, 0], model.actuator_biasprm[u], model.actuator_gear[u, 0]
             speed = float(live.velocity[dof])
             own = bias[0] + ratio * (bias[1] * live.position[position] + bias[2] * speed)
-            torque = limited(float(ratio * (gain * live.control[u] + own)), speed, 1.0 / a)
+            torque = full_voltage_torque(float(ratio * (gain * live.control[u] + own)), speed, 1.0 / a)
             live.control[u] = (torque / ratio - own) / gain
 
     return Influence(step=step)
 
 
-def limited(torque: float, speed: float, stall: float) -> float:
+def full_voltage_torque(torque: float, speed: float, stall: float) -> float:
     """The torque in N m of a motor with that stall torque at a speed in rad/s, of which `torque` is asked."""
     width = 0.5 * ROUNDING * stall
     for sign in (1.0, -1.0):

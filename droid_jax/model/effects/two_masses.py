@@ -116,9 +116,10 @@ def _of(servos: PositionServos, theta: Theta) -> tuple[jax.Array, jax.Array, jax
 def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -> GearStep:
     """One time step of the motors; see the module's text for the equations."""
     model, dofs, actuators = state.model, servos.dofs, servos.actuators
-    lead, speed, acceleration = state.motors[:, dofs]
+    before: jax.Array = state.motors[:, dofs]
+    lead, speed, acceleration = before[0], before[1], before[2]
     compliance, half, ratio = _of(servos, theta)
-    timestep = model.opt.timestep
+    timestep: jax.Array = jnp.asarray(model.opt.timestep)
     inertia = jnp.maximum(model.dof_armature[dofs], LEAST_INERTIA)
     stiffness, damping = servos.stiffness_in(state), servos.damping_in(state)
     rigid = servos.rigid_torque(state, ctrl)
@@ -133,7 +134,8 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
     coming = jnp.where(is_rigid, lead + timestep * speed + 0.5 * timestep**2 * alone, lead)
     free = jnp.abs(coming) < half
     end = jnp.where(free, 0.0, jnp.sign(coming) * half)
-    hard, soft = is_rigid & ~free, ~is_rigid & ~free
+    hard: jax.Array = is_rigid & ~free
+    soft: jax.Array = ~is_rigid & ~free
     spring = jnp.where(soft, 1.0 / jnp.maximum(compliance, LEAST_COMPLIANCE), 0.0)
     damper = 2.0 * ratio * jnp.sqrt(inertia * spring)
 
@@ -152,8 +154,8 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
     y_after, v_after, y_mean = flow(y, speed)
     u_after, w_after, u_mean = flow(-1.0 / total, jnp.zeros_like(y))
     u_after, u_mean = u_after + 1.0 / total, u_mean + 1.0 / total  # from rest at x = 0, of a constant B of 1 N m
-    share = jnp.where(hard, 1.0, spring * u_mean + damper * u_after / timestep)
-    own = jnp.where(hard, inertia * speed / timestep, spring * y_mean + damper * (y_after - y) / timestep)
+    share: jax.Array = jnp.where(hard, jnp.ones_like(y), spring * u_mean + damper * u_after / timestep)
+    own: jax.Array = jnp.where(hard, inertia * speed / timestep, spring * y_mean + damper * (y_after - y) / timestep)
 
     constant = torque - stiffness * end
     actuators_give = jnp.clip(rigid + (1.0 - share) * damping * state.qvel[dofs], low, high)
@@ -166,17 +168,17 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
 
     def after(qacc: jax.Array) -> jax.Array:
         drive = constant - (inertia + 0.5 * timestep * damping) * qacc[dofs]
-        moved = jnp.where(hard, end, end + y_after + drive * u_after)
-        faster = jnp.where(hard, 0.0, v_after + drive * w_after)
+        moved: jax.Array = jnp.where(hard, end, end + y_after + drive * u_after)
+        faster: jax.Array = jnp.where(hard, jnp.zeros_like(y), v_after + drive * w_after)
         # The acceleration of an impact ends with it and does not tell whether the contact lasts; that before it does.
-        lasting = jnp.where(hard & (speed != 0.0), acceleration, qacc[dofs])
+        lasting: jax.Array = jnp.where(hard & (speed != 0.0), acceleration, qacc[dofs])
         return state.motors.at[:, dofs].set(jnp.stack([moved, faster, lasting]))
 
     def reading(motors: jax.Array) -> jax.Array:
-        later, faster, qacc = motors[:, dofs]
+        later, faster, qacc = motors[0, dofs], motors[1, dofs], motors[2, dofs]
         middle = 0.5 * (lead + later)  # at the time of the position, half a step after `lead`
         elastic = middle - jnp.clip(middle, -half, half)
-        quicker = jnp.where(soft, 0.5 * (speed + faster), 0.0)
+        quicker: jax.Array = jnp.where(soft, 0.5 * (speed + faster), jnp.zeros_like(y))
         torque = push + (1.0 - share) * inertia * qacc + inertia * (faster - speed) / timestep
         return jnp.zeros_like(motors).at[:, dofs].set(jnp.stack([elastic, quicker, torque]))
 
