@@ -83,7 +83,7 @@ ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <actuator><position name="yaw" joint="yaw" kp="400"/><position name="shoulder" joint="shoulder" kp="900"/>
     <position name="elbow" joint="elbow" kp="400"/></actuator></mujoco>"""
 JOINTS = ("yaw", "shoulder", "elbow")
-SERVO = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><body name="arm">
+SERVO = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody><body name="arm">
   <joint name="j" axis="0 1 0" armature="0.01" damping="0.3" {friction}/>
   <geom type="capsule" size="0.01" fromto="0 0 0 0.15 0 0" mass="0.2" contype="0" conaffinity="0"/>
   <geom type="sphere" size="0.03" pos="0.15 0 0" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>

@@ -152,7 +152,8 @@ def _kernels(population: int, dims: int, redraws: int) -> _Kernels:
         init=jax.jit(jax.vmap(init, in_axes=(0, 0, None))),
         ask=jax.jit(jax.vmap(ask, in_axes=(0, None, 0, None, None))),
         tell=jax.jit(jax.vmap(tell, in_axes=(0, 0, 0, 0, None, None))),
-        params=jax.tree.map(np.asarray, evosax.default_params),
+        # In one program: evosax computes them by some sixty small ones, each compiled on its own.
+        params=jax.tree.map(np.asarray, jax.jit(lambda: evosax.default_params)()),
     )
 
 

@@ -6,6 +6,8 @@ effects that write model fields, profiles of servos (`Effect.profile`) and torqu
 
 from __future__ import annotations
 
+import copy
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -53,11 +55,13 @@ def c_replay(
     check_stateless(scene)
     if why := why_not_in_c(scene, space, drive.torque, effects):
         raise ValueError(f"the C engine cannot replay this: {why}; use MJX")
-    plain, factors = replace(scene, model=instrument(scene)), servo_factors(scene, drive)
+    plain, factors = _instrumented(scene), servo_factors(scene, drive)
     sent_by = _profiles(drive, effects)
 
     def piece(values: np.ndarray) -> Rollout:
-        models = [scale_gains(make_c_model(plain, space, row), factors) for row in values]
+        models = _models(plain, space, values.tobytes(), len(values))
+        if (factors != 1.0).any():
+            models = [scale_gains(copy.copy(model), factors) for model in models]
         thetas = [theta_of(space, row.tolist()) for row in values]
         sent = sent_by(thetas)
         control = np.stack(
@@ -87,6 +91,18 @@ def c_replay(
         return Rollout(**{f: np.concatenate([getattr(p, f) for p in pieces])[again.ravel()] for f in fields})
 
     return replay
+
+
+@functools.lru_cache(maxsize=8)
+def _instrumented(scene: Scene) -> Scene:
+    """The scene with sensors, the same for all recordings."""
+    return replace(scene, model=instrument(scene))
+
+
+@functools.lru_cache(maxsize=1)
+def _models(plain: Scene, space: Space, rows: bytes, count: int) -> Sequence[mujoco.MjModel]:
+    """The models of `count` rows of values (float64).  The recordings of a cost are replayed with the same rows."""
+    return [make_c_model(plain, space, row) for row in np.frombuffer(rows).reshape(count, -1)]
 
 
 def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
