@@ -4,10 +4,11 @@
 
 A servo-driven hinge and an arm of three joints, on the synthetic robot: one log of 24 s each, its positions alone or
 its torques too, searched in windows of time (`Split.WINDOWS`).  Every case draws a robot with all its nuisances.
-Hidden effects are 3 and 10 times their minimum effect size.  They are effects of the library, or errors of a set-up
-(`--hidden setup`).  FILE adds a third robot with nothing hidden, in positions: an SO-101 arm, whose MJCF is not part of
-this repository, with the parameters of experiments/so101.json.  One JSON file per case is written under RUNS.  A
-stopped run can be continued, and several processes can share the cases.
+Hidden effects are 3 and 10 times their minimum effect size.  They are effects of the library, or what is wrong with a
+set-up and with a servo (`--hidden setup`), then also on a lone servo with a pendulum, whose goal has steps.  FILE adds
+another robot with nothing hidden, in positions: an SO-101 arm, whose MJCF is not part of this repository, with the
+parameters of experiments/so101.json.  One JSON file per case is written under RUNS.  A stopped run can be continued,
+and several processes can share the cases.
 """
 
 from __future__ import annotations
@@ -267,7 +268,7 @@ def plans(arguments: Arguments) -> list[Plan]:
         each = [(*key, *one) for key, some in lists.items() for one in some]
         order = np.random.default_rng(arguments.seed).permutation(len(each))
         drawn = [each[order[n % len(each)]] for n in range(count)]
-        hidden = [Plan(f"{arguments.hidden}-{one[0]}-{one[1]}-{n}", *one) for n, one in enumerate(drawn)]
+        hidden = [Plan(f"{'-'.join(map(str, one[:3]))}-{one[3]:g}x-{n}", *one) for n, one in enumerate(drawn)]
     some = math.ceil(len(null) / max(len(hidden), 1))
     mixed = [p for n, one in enumerate(hidden) for p in (*null[n * some : (n + 1) * some], one)]
     mixed += null[len(hidden) * some :]

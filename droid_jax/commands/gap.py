@@ -151,7 +151,8 @@ def run(command: GapCommand) -> None:
     effects = chosen_effects(command, scene, given)
     start = None if fit is None else values_of(fit, base)
     fitted, judges = given[: len(command.recording)], given[len(command.recording) :]
-    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, fitted)}
+    scale = effect_scale(command, scene, given)
+    setup = {**setup_of(command), "command": "gap", **fingerprints(scene, base, fitted), "effect_scale": scale}
     setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if start is not None:
         setup["start"] = start.tolist()
@@ -186,7 +187,6 @@ def run(command: GapCommand) -> None:
         "setup": {
             **setup,
             "synthetic_robot": synthetic_robot,
-            "effect_scale": effect_scale(command, scene, given),
             "robot": robot,
             "hidden": in_words(robot.get("hide", ())),
         },
@@ -265,7 +265,8 @@ def effect_scale(command: GapCommand, scene: Scene, recordings: Sequence[Recordi
     """Scale of the library's forces and torques: the given one, or that of the machine."""
     from droid_jax.discrepancy.candidates import machine_scale
 
-    return machine_scale(scene, recordings) if command.effect_scale is None else command.effect_scale
+    fitted = recordings[: len(command.recording)]  # test recordings come after them
+    return machine_scale(scene, fitted) if command.effect_scale is None else command.effect_scale
 
 
 def chosen_effects(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from droid_jax.commands.folder import fingerprints, setup_of, stage_folder
-from droid_jax.commands.gap import GapCommand, chosen_effects, gap_config, gap_model, values_of
+from droid_jax.commands.gap import GapCommand, chosen_effects, effect_scale, gap_config, gap_model, values_of
 from droid_jax.commands.options import (
     Channel,
     JointFriction,
@@ -116,6 +116,7 @@ def run(command: Rehearse) -> None:
     config, rehearsal = gap_config(gap), RehearsalConfig(seed=command.seed)
     found, result = quick_rehearsal(scene, base, effects, recordings, plan, config, rehearsal, _print_stage)
     setup = {**setup_of(command), "command": "rehearse", **fingerprints(scene, base, recordings)}
+    setup["effect_scale"] = effect_scale(gap, scene, recordings)
     if plan.values:  # from a fit, whose folder may later hold another one
         setup["values"] = dict(plan.values)
     if command.full:

@@ -71,7 +71,7 @@ def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
     An effect that moves the robot can change all of them.  A sensor model is tried on a random motion: a torque offset
     does not show in positions.
     """
-    moves = effect.command or effect.servo or effect.gear or effect.force or effect.frictionloss
+    moves = effect.command or effect.servo or effect.limits or effect.gear or effect.force or effect.frictionloss
     if moves or effect.observe is None or any(p.writes for p in effect.parameters):
         return True
     rng = np.random.default_rng(0)
@@ -90,7 +90,7 @@ def acts_on_commands_only(effect: Effect) -> bool:
     This includes effects without functions whose parameters write only model fields of these (`servo_gain`,
     `soft_friction`).
     """
-    if effect.profile or effect.command or effect.servo or effect.gear:
+    if effect.profile or effect.command or effect.servo or effect.limits or effect.gear:
         return True
     fields = [w.field for p in effect.parameters for w in p.writes]
     laws = (effect.force, effect.frictionloss, effect.observe)

@@ -115,7 +115,7 @@ def neutral_json(
     intervals = dict(zip(space.names, np.stack(gaussian.interval(0.9), axis=1).tolist(), strict=True))
     priors = dict(zip(space.names, np.stack(prior(space).interval(0.9), axis=1).tolist(), strict=True))
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    laws = [e for e in effects if e.profile or e.command or e.servo or e.gear or e.force or e.frictionloss]
+    laws = [e for e in effects if e.profile or e.command or e.servo or e.limits or e.gear or e.force or e.frictionloss]
     fitted = (
         with_numbers(scene, space, np.asarray(values)) if laws else None
     )  # MJX may not support a scene without laws

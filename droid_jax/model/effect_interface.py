@@ -33,9 +33,9 @@ class State:
         model: the sample's mjx.Model, with the values of its parameters (such as servo gains).
         pose: mjx.Data with the kinematics of qpos; None if they are not computed.
         gear: [2, nv] N m, at the time of `load`: torque of the motors on the gears (actuators and gravity compensation)
-            and torque of the links on them (`step.gear_torques`); None if no effect changes dry friction.
+            and torque of the links on them (`step.gear_torques`); zero if no effect changes dry friction.
         motors: [3, nv] the state of gears (`Gear`): rad and rad/s by which the motors are ahead of their links, half a
-            step before, and the links' acceleration in the previous step, rad/s^2; None if no effect has a `gear`.
+            step before, and the links' acceleration in the previous step, rad/s^2; zero if no effect has a `gear`.
     """
 
     time: jax.Array
@@ -119,6 +119,7 @@ class Effect:
             coefficient, which other programs can do too; empty for another profile.
         command: (theta, time [], command_at) -> [U]; command_at(t) is the command at time t [s].
         servo: (theta, State, ctrl [U]) -> [U], the servo's input in place of the command.
+        limits: (theta, State) -> [U, 2] N m (N), lowest and highest force of each actuator in the step; infinite: none.
         gear: the gears between motors and links, in place of rigid ones.
         force: (theta, State) -> [nv] generalised force, added to qfrc_applied.
         frictionloss: (theta, State, base [nv]) -> [nv] N m, friction loss of the step.
@@ -147,6 +148,7 @@ class Effect:
     profile_limits: str = ""
     command: Callable[[Theta, jax.Array, Callable], jax.Array] | None = None
     servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
+    limits: Callable[[Theta, State], jax.Array] | None = None
     gear: Gear | None = None
     force: Callable[[Theta, State], jax.Array] | None = None
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
@@ -164,7 +166,17 @@ class Effect:
     over_time: bool = False
 
 
-LAWS = ("profile", "command", "servo", "gear", "force", "frictionloss", "observe", "native")  # fields with functions
+LAWS = (
+    "profile",
+    "command",
+    "servo",
+    "limits",
+    "gear",
+    "force",
+    "frictionloss",
+    "observe",
+    "native",
+)  # fields with functions
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

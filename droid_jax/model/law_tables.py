@@ -111,6 +111,8 @@ def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
             yield from law.of_state(acts)
     if effect.servo is not None:
         yield law.of_servo()
+    if effect.limits is not None:
+        yield law.no_table("a limit of the servo's torque that depends on speed")
     if effect.gear is not None:
         yield law.no_table("the motor behind the gear has a state of its own")
 

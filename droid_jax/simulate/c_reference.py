@@ -116,7 +116,7 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         torque: the torque convention of the recording.
         effects: in the replay, without those of the torque offsets.
     """
-    functions = ("command", "servo", "gear", "force", "frictionloss", "observe")
+    functions = ("command", "servo", "limits", "gear", "force", "frictionloss", "observe")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
@@ -180,7 +180,7 @@ def c_path_torques(
 
 def why_no_path_in_c(space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
     """Why plain C cannot replay a measured motion; empty if it can.  The arguments are those of `why_not_in_c`."""
-    functions = ("command", "servo", "gear", "profile", "force", "frictionloss")
+    functions = ("command", "servo", "limits", "gear", "profile", "force", "frictionloss")
     if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
         return f"effects depend on the state: {', '.join(active)}"
     if not torque.gravity and any(w.field == "qpos0" for p in space.parameters for w in p.writes):

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Gear, GearStep, Rollout, State, Theta
 from droid_jax.model.encoders import misplaced_compensation
@@ -75,19 +76,19 @@ def step_with_effects(
         servo_damping: as in `simulate_step`.
     """
     ctrl, gears = servo_input(command, theta, state, effects), None
-    used = apply_friction(model, theta, state, effects)
+    used = apply_limits(apply_friction(model, theta, state, effects), theta, state, effects)
     if gear := gear_of(effects):
         gears = gear.step(theta, replace(state, model=used), ctrl)
         used = gears.model
     before = template.replace(qpos=moving.qpos, qvel=moving.qvel, qacc_warmstart=moving.warm, ctrl=ctrl)
     push = apply_forces(theta, state, effects, error, gears)
     after = simulate_step(used, before, parity=parity, servo_damping=servo_damping, push=push)
-    torques = moving.gear
+    torques, load = moving.gear, after.qfrc_actuator if gears is None else after.qfrc_actuator + gears.push
     if changes_friction(effects):
         torques = gear_torques(used, after, moving.qvel)
         torques = torques if gears is None else torques + jnp.stack([gears.push, -gears.push])
     motors = moving.motors if gears is None else gears.after((after.qvel - moving.qvel) / model.opt.timestep)
-    carried = Moving(after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, torques, motors)
+    carried = Moving(after.qpos, after.qvel, after.qacc_warmstart, load, torques, motors)
     return Stepped(after, carried, used, gears)
 
 
@@ -95,7 +96,10 @@ def gear_of(effects: Sequence[Effect]) -> Gear | None:
     """The law of the gears; None if all are rigid.  ValueError where effects have different ones."""
     named = {effect.name: effect.gear for effect in effects if effect.gear is not None}
     if len(set(map(id, named.values()))) > 1:
-        raise ValueError(f"effects {', '.join(named)} have different laws of the gears, and a replay has one")
+        raise ValueError(
+            f"effects {', '.join(named)} have different laws of the gears, and a replay has one: leave some of them "
+            "out (gap --without)"
+        )
     return next(iter(named.values()), None)
 
 
@@ -132,6 +136,19 @@ def apply_friction(model, theta: Theta, state: State, effects: Sequence[Effect])
         if effect.frictionloss is not None:
             loss = effect.frictionloss(theta, state, loss)
     return model if loss is model.dof_frictionloss else model.replace(dof_frictionloss=loss)
+
+
+def apply_limits(model, theta: Theta, state: State, effects: Sequence[Effect]):
+    """The model with the force ranges that effects give to its actuators in this state, within its own."""
+    laws = [effect.limits for effect in effects if effect.limits is not None]
+    if not laws:
+        return model
+    own = np.asarray(model.actuator_forcelimited, bool)[:, None]
+    ranges: jax.Array = jnp.where(own, jnp.asarray(model.actuator_forcerange), jnp.array([-jnp.inf, jnp.inf]))
+    for law in laws:
+        ends = law(theta, state)
+        ranges = jnp.stack([jnp.maximum(ranges[:, 0], ends[:, 0]), jnp.minimum(ranges[:, 1], ends[:, 1])], axis=1)
+    return model.replace(actuator_forcelimited=np.ones(len(own), bool), actuator_forcerange=ranges)
 
 
 def apply_forces(

@@ -157,7 +157,7 @@ def path_replay(
             fluid.
     """
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
-    steering = [e.name for e in effects if e.profile or e.command or e.servo or e.gear]
+    steering = [e.name for e in effects if e.profile or e.command or e.servo or e.limits or e.gear]
     if steering:
         raise ValueError(f"effects {', '.join(steering)} change commands, which a prescribed motion does not have")
     joints = joints or scene.joints

@@ -70,8 +70,12 @@ def _motors(place: Place, gear: Callable[[float], Spring], encoder_on_motor: boo
         for actuator, dof, position, column in zip(place.actuators, place.dofs, place.qpos, place.columns, strict=True):
             inertia = float(model.dof_armature[dof])
             if inertia > 0.0:
-                motors.append(_Motor(int(actuator), int(dof), int(position), int(column), inertia, gear(inertia)))
+                gain, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator, :3].tolist()
+                addresses = int(actuator), int(dof), int(position), int(column)
+                motors.append(_Motor(*addresses, inertia, gear(inertia), gain, bias))
+                # The motor is simulated here, and its gear's torque is applied to the link.
                 model.dof_armature[dof] = 0.0
+                model.actuator_gainprm[actuator] = model.actuator_biasprm[actuator] = 0.0
         if not motors:
             raise ValueError(
                 f"a motor that is a mass of its own needs the armature of its joint; {', '.join(place.joints)} has none"
@@ -88,7 +92,7 @@ def _motors(place: Place, gear: Callable[[float], Spring], encoder_on_motor: boo
     def sense(signals: SensorInput) -> SensorInput:
         position, torque, columns = signals.position.copy(), signals.torque.copy(), [m.column for m in motors]
         if place.side is TorqueSide.MOTOR:
-            torque[:, columns] = np.array(torques)
+            torque[:, columns] += np.array(torques)  # the actuators give none
         if encoder_on_motor:
             position[:, columns] = np.array(angles)
         return SensorInput(signals.clock, torque, position)
@@ -104,6 +108,7 @@ class _Motor:
         actuator, dof, position, column: addresses of its servo, its joint and its sensors.
         inertia: kg m^2.
         gear: the torque of its gear.
+        gain, bias: of its servo's law.
         angle, speed: its state, rad and rad/s at the joint.
     """
 
@@ -113,28 +118,47 @@ class _Motor:
     column: int
     inertia: float
     gear: Spring
+    gain: float
+    bias: list[float]
     angle: float = 0.0
     speed: float = 0.0
 
     def turn(self, live: Live) -> float:
-        """Move through one step, and set the command with which the actuator gives the gear's mean torque.
+        """Move through one step, and put the gear's mean torque on the link, in place of the actuator's.
 
         Returns the motor's mean torque, N m.
         """
         model, u = live.model, self.actuator
-        gain, ratio = float(model.actuator_gainprm[u, 0]), float(model.actuator_gear[u, 0])
-        b0, b1, b2 = (float(b) for b in model.actuator_biasprm[u, :3])
+        gain, ratio = self.gain, float(model.actuator_gear[u, 0])
+        b0, b1, b2 = self.bias
         link, moving = float(live.position[self.position]), float(live.velocity[self.dof])
+        command, (low, high) = float(live.control[u]), _limits(model, u, self.dof)
+        if model.actuator_ctrllimited[u]:
+            command = min(max(command, float(model.actuator_ctrlrange[u, 0])), float(model.actuator_ctrlrange[u, 1]))
         parts = max(1, math.ceil(live.timestep / SUBSTEP - 1e-9))
         h, mean, given = live.timestep / parts, 0.0, 0.0
         for part in range(parts):
-            torque = ratio * (gain * float(live.control[u]) + b0 + ratio * (b1 * self.angle + b2 * self.speed))
+            torque = ratio * (gain * command + b0 + ratio * (b1 * self.angle + b2 * self.speed))
+            torque = min(max(torque, low), high)
             force = self.gear(self.angle - link - part * h * moving, self.speed - moving)
             self.speed += h * (torque - force) / self.inertia
             self.angle += h * self.speed
             mean, given = mean + force / parts, given + torque / parts
-        live.control[u] = (mean / ratio - b0 - ratio * (b1 * link + b2 * moving)) / gain
+        live.applied[self.dof] += mean
+        live.gear[self.dof] += mean
         return given
+
+
+def _limits(model: mujoco.MjModel, actuator: int, dof: int) -> tuple[float, float]:
+    """Lowest and highest torque of a joint's servo, N m, of its actuator and its joint."""
+    low, high, joint = -math.inf, math.inf, int(model.dof_jntid[dof])
+    if model.actuator_forcelimited[actuator]:
+        ends = sorted(float(model.actuator_gear[actuator, 0]) * float(e) for e in model.actuator_forcerange[actuator])
+        low, high = ends
+    if model.jnt_actfrclimited[joint]:
+        ends = [float(e) for e in model.jnt_actfrcrange[joint]]
+        low, high = max(low, ends[0]), min(high, ends[1])
+    return low, high
 
 
 def hide_torque_line(place: Place, a: float) -> Influence:

@@ -77,6 +77,7 @@ LIBRARY = {
 }
 # Effect of the library -> its name on the object's hinge.
 ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
+OWN_MOTOR = ("resonance", "free_play")
 LONGEST_STEP = 0.00025  # s, for a stable integration of the explicit torques of hidden effects
 PAUSE = 5.0  # s between repeats, for effects that warm up or drift
 
@@ -134,6 +135,8 @@ def record_hidden(
     applied = as_applied(effects)
     for one in applied:
         check(one, scene)
+    # A motor that is simulated by itself comes first: what others do to commands and sensors, they do to its own.
+    applied = sorted(applied, key=lambda one: one.name not in OWN_MOTOR)
     synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
     rows, gears, sensors, synthetic_robot = _simulate(synthetic_robot, applied)
     trace = split(synthetic_robot.scene, rows)

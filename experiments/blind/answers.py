@@ -87,7 +87,7 @@ ANSWERS: dict[str, Answer] = {
         "", why="a play that the command leads; joint_backlash follows the load and explains none of it", scenes=SERVO
     ),
     "resonance": Answer(
-        "two_mass_resonance", ("joint_compliance", "servo_gain"), "a slow motion leaves the gear's twist alone", SERVO
+        "two_mass_resonance", ("joint_compliance", "servo_gain"), "slow motions show the gear's twist alone", SERVO
     ),
     "free_play": Answer(
         "two_mass_backlash", ("joint_backlash",), "a motor that crosses the gap at once has no state", SERVO
@@ -98,10 +98,7 @@ ANSWERS: dict[str, Answer] = {
     ),
     "grip_compliance": Answer("contact_compliance"),
     "firm_friction": Answer("soft_friction", scenes=("bench",), why="only the elbow there has friction of its own"),
-    "tilted_base": Answer(
-        "gravity_direction", ("encoder_offset",), "of one joint alone a lean in its plane is an offset of its encoder",
-        ("bench", "arm", "door"),
-    ),
+    "tilted_base": Answer("gravity_direction", scenes=("bench", "arm", "door")),
     "encoder_zero": Answer(
         "encoder_offset", ("gravity_direction",), "of links in one plane a lean is an offset of the first joint",
         ("bench", "arm", "door"),
@@ -134,6 +131,10 @@ OF_HINGE = frozenset({
     "hinge_preload", "tilted_frame", "hardening_spring", "over_centre_spring", "latch", "door_closer", "opening_check",
     "drag", "angle_friction", "hinge_stribeck", "hinge_directional",
 })  # fmt: skip
+# A lean in the plane of a joint that is alone is exactly an offset of its encoder.
+ALONE = {"tilted_base": ("encoder_offset",)}
+# The lone servo's log has steps, in which a motor's own state shows.
+NO_TIES = (("resonance", "servo"), ("free_play", "servo"))
 WHOLE = (
     "command_delay",
     "clock_rate",
@@ -177,7 +178,9 @@ def right(scene: Scene, hidden: Applied) -> tuple[str, ...]:
     answer = ANSWERS[hidden.name]
     if not answer.exact:
         return ()
-    names = (_at(scene, name, hidden.joint) for name in (answer.exact, *answer.ties))
+    ties = () if (hidden.name, scene.name) in NO_TIES else answer.ties
+    alone = ALONE.get(hidden.name, ()) if len(scene.joints) == 1 and not scene.object_joint else ()
+    names = (_at(scene, name, hidden.joint) for name in (answer.exact, *ties, *alone))
     return tuple(dict.fromkeys(n for n in names if n))
 
 

@@ -46,7 +46,11 @@ class PositionServos:
         gain, bias = self.law(state)
         length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
         feedback = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
-        return jnp.asarray(self.gear) * (gain * ctrl[self.actuators] + feedback)
+        given, limited = ctrl[self.actuators], np.asarray(state.model.actuator_ctrllimited, bool)[self.actuators]
+        if limited.any():
+            low, high = state.model.actuator_ctrlrange[self.actuators].T
+            given = jnp.where(limited, jnp.clip(given, low, high), given)
+        return jnp.asarray(self.gear) * (gain * given + feedback)
 
     def stiffness_in(self, state: State) -> jax.Array:
         """[J] N m/rad at the joint, of the sample's model."""

@@ -17,6 +17,7 @@ from droid_jax.model.scene import Scene
 
 LINE, SLOPE = "torque_speed_line", "torque_speed_slope"
 SLOPES = (0.0, 0.2)  # s/rad, one over the no-load speed
+LEAST = 1e-6  # 1/(N m), of a limit that is finite
 USUAL_SPEED = 1.0  # rad/s, of motions that are recorded
 
 
@@ -27,13 +28,12 @@ def torque_speed_line(scene: Scene) -> Effect | None:
     if servos is None:
         return None
 
-    def servo(theta, state, ctrl):
-        inverse, slope = column(theta, LINE, servos.joints), a.value(theta, SLOPE)
-        limit = 1.0 / jnp.maximum(inverse, 1e-6)
-        fall = slope * state.qvel[servos.dofs]
-        torque = servos.rigid_torque(state, ctrl)
-        excess = jnp.clip(torque, -limit * (1.0 + fall), limit * (1.0 - fall)) - torque
-        return servos.with_torque(state, ctrl, jnp.where(inverse > 0.0, excess, 0.0))
+    def limits(theta, state):
+        inverse, fall = column(theta, LINE, servos.joints), a.value(theta, SLOPE) * state.qvel[servos.dofs]
+        stall, none = 1.0 / jnp.maximum(inverse, LEAST), jnp.array([-jnp.inf, jnp.inf])
+        ends = jnp.stack([-stall * (1.0 + fall), stall * (1.0 - fall)], axis=1) / servos.gear[:, None]
+        every = jnp.tile(none, (len(state.model.actuator_gear), 1))
+        return every.at[servos.actuators].set(jnp.where(inverse[:, None] > 0.0, jnp.sort(ends, axis=1), none))
 
     rubbing = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
     usual = dict(zip(servos.joints, usual_torques(scene, servos.joints) + rubbing, strict=True))
@@ -41,7 +41,7 @@ def torque_speed_line(scene: Scene) -> Effect | None:
     return Effect(
         LINE,
         (*of_joints, a.shape(SLOPE, "s/rad", SLOPES, 0.0, 1.0)),
-        servo=servo,
+        limits=limits,
         description="a motor whose torque is limited, the more the faster it turns",
         signature="fast or heavily loaded moves of that joint, which lag while its command is far ahead",
         confused_with=("profile_acceleration", "profile_speed", "servo_gain", "joint_compliance"),

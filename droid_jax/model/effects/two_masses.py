@@ -7,19 +7,25 @@ With the motor's angle theta, the link's q, the gear's torque F and the motor's 
 d is the lead of the motor, o the nearer end of the backlash, c the compliance of the gear and D its damping.  F is zero
 inside the backlash.  Damping and dry friction of the joint act on the link.
 
-In a time step the motor's equation is solved exactly for a constant link acceleration.  Its solution is linear in that
-acceleration, so that the gear's mean torque is a constant minus a share of J q''.  The link then moves with that share
-of the armature in one solve with everything else, and the step is stable at any stiffness.  As the compliance vanishes
-the share is one, and the replay is that of a rigid gear.  A rigid gear that meets the end of its backlash does not
-rebound: momentum is conserved, and the two move together until the torque on the contact changes its sign.
+In a time step the motor moves by the implicit midpoint rule.  The gear's mean torque is then a constant minus a share
+of J q'', and the link moves with that share of the armature in one solve with everything else: both masses are
+implicit, and the step is stable at any stiffness.  As the compliance vanishes the share is one, and the replay is that
+of a rigid gear.  A rigid gear that meets the end of its backlash does not rebound: momentum is conserved, and the two
+move together until the torque on the contact changes its sign.
+
+A weight that MuJoCo compensates (gravcomp) acts on the link and not through the gear, as a robot's motors would carry
+it, so arms with compensated bodies do not have these effects.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Gear, GearStep, State, Theta, column
 from droid_jax.model.effects import coefficients as a
@@ -78,9 +84,23 @@ def two_mass_backlash(scene: Scene) -> Effect | None:
 
 
 def _geared(scene: Scene) -> PositionServos | None:
-    """The position servos of joints with an armature, which is the inertia of the motor; None if there are none."""
-    servos = arm_servos(scene)
-    return None if servos is None else servos.where(scene.model.dof_armature[servos.dofs] > 0.0)
+    """The position servos of joints with an armature, which is the inertia of the motor; None if there are none.
+
+    None also if the weight of a body behind one of them is compensated.
+    """
+    servos, model = arm_servos(scene), scene.model
+    if servos is None:
+        return None
+    joints = set(model.dof_jntid[servos.dofs].tolist())
+    carried = (joints.intersection(_joints_above(model, int(body))) for body in np.flatnonzero(model.body_gravcomp))
+    return None if any(carried) else servos.where(model.dof_armature[servos.dofs] > 0.0)
+
+
+def _joints_above(model: mujoco.MjModel, body: int) -> Iterator[int]:
+    """Joints that move a body."""
+    while body:
+        yield from range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+        body = int(model.body_parentid[body])
 
 
 @functools.lru_cache(maxsize=64)
@@ -95,7 +115,10 @@ def _gear(scene: Scene) -> Gear:
     def start(theta: Theta, state: State, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         compliance, half, _ = _of(servos, theta)
         # qpos is what was recorded: the link's position and the twist of the gear.
-        stiffness, torque = servos.stiffness_in(state), servos.rigid_torque(state, ctrl)
+        stiffness, torque = (
+            servos.stiffness_in(state),
+            jnp.clip(servos.rigid_torque(state, ctrl), *servos.limits_in(state)),
+        )
         free = torque / stiffness  # the lead at which the servo is at its goal
         elastic = compliance * (torque - stiffness * jnp.sign(torque) * half)
         inside = jnp.abs(free) < half
@@ -110,7 +133,7 @@ def _gear(scene: Scene) -> Gear:
 def _of(servos: PositionServos, theta: Theta) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Compliance [J] rad/(N m), half of the backlash [J] rad, and damping ratio []."""
     compliance, backlash = column(theta, RESONANCE, servos.joints), column(theta, BACKLASH, servos.joints)
-    return jnp.abs(compliance), 0.5 * jnp.abs(backlash), a.value(theta, DAMPING, DAMPING_RATIOS[0])
+    return jnp.abs(compliance), 0.5 * jnp.abs(backlash), a.value(theta, DAMPING, DAMPING_RATIOS[-1])
 
 
 def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -> GearStep:
@@ -136,40 +159,28 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
     end = jnp.where(free, 0.0, jnp.sign(coming) * half)
     hard: jax.Array = is_rigid & ~free
     soft: jax.Array = ~is_rigid & ~free
-    spring = jnp.where(soft, 1.0 / jnp.maximum(compliance, LEAST_COMPLIANCE), 0.0)
-    damper = 2.0 * ratio * jnp.sqrt(inertia * spring)
+    stiff: jax.Array = 1.0 / jnp.maximum(compliance, LEAST_COMPLIANCE)
+    spring: jax.Array = jnp.where(soft, stiff, jnp.zeros_like(stiff))
+    damper: jax.Array = jnp.where(soft, 2.0 * ratio * jnp.sqrt(inertia * stiff), jnp.zeros_like(stiff))
 
-    # J x'' + (k_v + D) x' + (k_p + 1 / c) x = B - J' q'', x = d - o; the servo damps with the step's mean velocity.
-    total, decay = stiffness + spring, (damping + damper) / (2.0 * inertia)
-    omega2 = total / inertia
-    cosine, sine = _decaying(decay, omega2, timestep)
-
-    def flow(y: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Without B: displacement and speed after the step, and the displacement's mean in it."""
-        after = (cosine + decay * sine) * y + sine * v
-        faster = (cosine - decay * sine) * v - omega2 * sine * y
-        return after, faster, -((faster - v) + 2.0 * decay * (after - y)) / (omega2 * timestep)
-
-    y = lead - end
-    y_after, v_after, y_mean = flow(y, speed)
-    u_after, w_after, u_mean = flow(-1.0 / total, jnp.zeros_like(y))
-    u_after, u_mean = u_after + 1.0 / total, u_mean + 1.0 / total  # from rest at x = 0, of a constant B of 1 N m
-    share: jax.Array = jnp.where(hard, jnp.ones_like(y), spring * u_mean + damper * u_after / timestep)
-    own: jax.Array = jnp.where(hard, inertia * speed / timestep, spring * y_mean + damper * (y_after - y) / timestep)
-
-    constant = torque - stiffness * end
-    actuators_give = jnp.clip(rigid + (1.0 - share) * damping * state.qvel[dofs], low, high)
-    push = own + share * constant - actuators_give
-    bias = model.actuator_biasprm
+    # The mean speed of the lead is (pull - J' q'') / resistance; J' has the servo's damping at the link's mean speed.
+    resistance = 2.0 * inertia / timestep + 0.5 * timestep * (stiffness + spring) + damping + damper
+    pull = torque + 2.0 * inertia * speed / timestep - stiffness * lead - spring * (lead - end)
+    share: jax.Array = jnp.where(hard, jnp.ones_like(lead), (0.5 * timestep * spring + damper) / resistance)
+    force: jax.Array = jnp.where(
+        hard, inertia * speed / timestep + torque - stiffness * end, spring * (lead - end) + share * pull
+    )
+    push = force - jnp.clip(rigid + (1.0 - share) * damping * state.qvel[dofs], low, high)
+    armature, bias = model.dof_armature, model.actuator_biasprm
     geared = model.replace(
-        dof_armature=model.dof_armature.at[dofs].multiply(share),
-        actuator_biasprm=bias.at[actuators, 2].multiply(share),
+        dof_armature=armature.at[dofs].set(armature[dofs] * share),
+        actuator_biasprm=bias.at[actuators, 2].set(bias[actuators, 2] * share),
     )
 
     def after(qacc: jax.Array) -> jax.Array:
-        drive = constant - (inertia + 0.5 * timestep * damping) * qacc[dofs]
-        moved: jax.Array = jnp.where(hard, end, end + y_after + drive * u_after)
-        faster: jax.Array = jnp.where(hard, jnp.zeros_like(y), v_after + drive * w_after)
+        mean = (pull - (inertia + 0.5 * timestep * damping) * qacc[dofs]) / resistance
+        moved: jax.Array = jnp.where(hard, end, lead + timestep * mean)
+        faster: jax.Array = jnp.where(hard, jnp.zeros_like(lead), 2.0 * mean - speed)
         # The acceleration of an impact ends with it and does not tell whether the contact lasts; that before it does.
         lasting: jax.Array = jnp.where(hard & (speed != 0.0), acceleration, qacc[dofs])
         return state.motors.at[:, dofs].set(jnp.stack([moved, faster, lasting]))
@@ -178,22 +189,8 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
         later, faster, qacc = motors[0, dofs], motors[1, dofs], motors[2, dofs]
         middle = 0.5 * (lead + later)  # at the time of the position, half a step after `lead`
         elastic = middle - jnp.clip(middle, -half, half)
-        quicker: jax.Array = jnp.where(soft, 0.5 * (speed + faster), jnp.zeros_like(y))
+        quicker: jax.Array = jnp.where(soft, 0.5 * (speed + faster), jnp.zeros_like(speed))
         torque = push + (1.0 - share) * inertia * qacc + inertia * (faster - speed) / timestep
         return jnp.zeros_like(motors).at[:, dofs].set(jnp.stack([elastic, quicker, torque]))
 
     return GearStep(geared, jnp.zeros_like(state.qvel).at[dofs].set(push), after, reading)
-
-
-def _decaying(decay: jax.Array, omega2: jax.Array, time: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """exp(-decay t) cos(w t) and exp(-decay t) sin(w t) / w, w^2 = omega2 - decay^2; hyperbolic below zero."""
-    square = omega2 - decay**2
-    root = jnp.sqrt(jnp.maximum(jnp.abs(square), 1e-12))
-    envelope = jnp.exp(-decay * time)
-    slow, fast = jnp.exp((root - decay) * time), jnp.exp(-(root + decay) * time)
-    over = square < 0.0
-    # decay >= root if overdamped, so that neither exponential grows.
-    slow = jnp.where(over, slow, 0.0)
-    cosine = jnp.where(over, 0.5 * (slow + fast), envelope * jnp.cos(root * time))
-    sine = jnp.where(over, 0.5 * (slow - fast), envelope * jnp.sin(root * time)) / root
-    return cosine, sine

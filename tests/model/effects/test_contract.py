@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_bench import Bench, bare, coefficients, door, door_bench, everywhere, make_bench, mechanism, typical
+from effect_oracles import OF_THEIR_OWN
 
 from droid_jax.model.effect_interface import LAWS, Effect, Rollout, State
 from droid_jax.model.effects.registry import library, registered
@@ -40,8 +41,9 @@ def effect(request: pytest.FixtureRequest, scene: Scene) -> Effect:
     made = library(scene, [request.param])
     if not made:
         where = scene.name.split(" (")[0]
-        assert (request.param, where) in (("contact_compliance", "mechanism"), ("soft_friction", "door"))
-        pytest.skip("nothing is gripped in the small scene, and the Panda's model has no friction that could be soft")
+        weightless = {(name, of) for name in OF_THEIR_OWN for of in ("mechanism", "door")}
+        assert (request.param, where) in {("contact_compliance", "mechanism"), ("soft_friction", "door"), *weightless}
+        pytest.skip("nothing is gripped here, no friction could be soft, or weight is compensated (test_two_masses.py)")
     return made[0]
 
 
@@ -50,7 +52,10 @@ def having(part: str) -> list[str]:
     return [effect.name for effect in library(mechanism()) if getattr(effect, part)]
 
 
-@pytest.fixture(params=[n for n in EFFECTS if n != "contact_compliance"])
+ELSEWHERE = ("contact_compliance", *OF_THEIR_OWN)  # effects that the small scene does not have
+
+
+@pytest.fixture(params=[n for n in EFFECTS if n not in ELSEWHERE])
 def built_in(request: pytest.FixtureRequest, small: Bench) -> Effect:
     """Each effect of the small scene, as in its compiled replay."""
     return small.effect(request.param)
@@ -312,7 +317,7 @@ def test_nothing_chatters(small: Bench, built_in: Effect):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in EFFECTS if n != "contact_compliance"])
+@pytest.mark.parametrize("name", [n for n in EFFECTS if n not in ELSEWHERE])
 def test_each_effect_at_neutral_is_the_scene_without_effects(small: Bench, small_bare: Rollout, name: str):
     check_neutral(make_bench(small.scene, small.drive, [small.effect(name)]), small_bare)
 
@@ -325,7 +330,7 @@ def test_neutral_is_the_door_without_effects(real: Bench):
 
 
 # Its arm has no friction of its own that could be soft, and its slow motions reach no limit of a servo's goal.
-NOT_ON_THE_DOOR = ("soft_friction", "profile_acceleration", "profile_speed")
+NOT_ON_THE_DOOR = ("soft_friction", "profile_acceleration", "profile_speed", *OF_THEIR_OWN)
 
 
 @pytest.mark.slow

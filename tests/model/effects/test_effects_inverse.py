@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from effect_bench import JOINTS, MECHANISM, mechanism
-from effect_oracles import OF_THEIR_OWN, ORACLES, SLOW, Now
+from effect_oracles import ORACLES, SLOW, Now
 
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects.registry import effect_space, library
@@ -26,7 +26,7 @@ from droid_jax.simulate.replay import Replay
 
 MOTOR, LINK = TorqueSide.MOTOR, TorqueSide.LINK
 STEERING = ("clock_rate", "command_delay", "joint_backlash", "joint_compliance", "profile_acceleration",
-            "profile_speed", "torque_speed_line", *OF_THEIR_OWN, "velocity_feedforward")  # fmt: skip
+            "profile_speed", "torque_speed_line", "velocity_feedforward")  # fmt: skip
 COULOMB = 0.15  # N m: the friction that a link-side sensor sees already, in one row of each comparison
 TOLERANCE = 1e-4  # N m: float32, 6e-8 of inertias times accelerations and of 9 N m of weight, summed
 
@@ -209,10 +209,8 @@ def test_servo_gains_have_no_effect(inverse: Inverse):
 def test_these_are_all_effects(scene: Scene):
     """A new effect must be added to one of these lists."""
     left = {n for n, o in ORACLES.items() if not (o.force or o.loss or o.read)}
-    assert left == {"payload", "free_payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING} - {
-        *OF_THEIR_OWN
-    }
-    assert {e.name for e in library(scene)} == {*ORACLES, *OF_THEIR_OWN}
+    assert left == {"payload", "free_payload", "servo_gain", "encoder_offset", "soft_friction", *STEERING}
+    assert {e.name for e in library(scene)} == {*ORACLES}
 
 
 @pytest.mark.parametrize("name", STEERING)

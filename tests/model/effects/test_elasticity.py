@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 from effect_bench import ARM, door, mechanism
 
+from droid_jax.discrepancy.candidates import machine_scale
 from droid_jax.discrepancy.config import SelectionConfig
+from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Rollout, State
+from droid_jax.model.effects.effect_scaling import scale_of, usual_torques
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
 from droid_jax.model.fields import servo_scale
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene
+from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.replay import Drive
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.4])
@@ -106,3 +112,46 @@ def test_a_floating_body_has_none():
     )
     scene = compile_scene(spec, "flies", joints=("j",))
     assert turned(scene, scene.id("body", "arm")) is None
+
+
+# ----- a motor at its full voltage, and the sizes of effects on other machines
+
+
+@pytest.mark.parametrize("kv", [0.0, 30.0])
+@pytest.mark.parametrize("timestep", [0.001, 0.004])
+def test_a_motor_at_its_full_voltage_stays_on_its_line(kv: float, timestep: float):
+    """Also where the servo damps: a motor at its limit does not."""
+    spec = mujoco.MjSpec.from_string(
+        f"""<mujoco><option timestep="{timestep}" integrator="implicitfast"/><worldbody><body>
+        <joint name="j" axis="0 0 1" armature="0.1"/><geom size="0.05" mass="0.1" contype="0" conaffinity="0"/></body>
+        </worldbody><actuator><position joint="j" kp="1000" kv="{kv}"/></actuator></mujoco>"""
+    )
+    scene = compile_scene(spec, "motor", joints=("j",))
+    effects = library(scene, ["torque_speed_line"])
+    space = Space(tuple(p for e in effects for p in e.parameters))
+    command = np.r_[np.zeros(5), np.full(round(0.15 / timestep), 3.0)][:, None]
+    drive = Drive(command, np.zeros(1), timestep, TorqueConvention(TorqueSide.MOTOR, gravity=True))
+    values = space.values({"torque_speed_line[j]": 0.1, "torque_speed_slope": 0.1})
+    found = compiled_replay("mjx", scene, space, drive, effects)(np.tile(values, (2, 1)))
+    torque, speed = (np.asarray(trace)[0, 8:, 0] for trace in (found.torque, found.velocity))
+    # J w' = T (1 - s w): the line's own solution, at full voltage all the time.
+    np.testing.assert_allclose(torque, 10.0 * (1.0 - 0.1 * speed), atol=0.02 * 10.0)
+    assert speed[-1] > 5.0
+
+
+def test_the_scale_of_a_machine_is_rounded_towards_a_panda():
+    assert [scale_of(x) for x in (0.0, 54.0, 20.0, 150.0, 200.0, 5.0, 0.9)] == [1.0, 1.0, 1.0, 1.0, 3.0, 0.1, 0.03]
+    assert machine_scale(door_scene(springs=1), []) == 1.0
+    model = mechanism()
+    weight = (1.5 * 0.15 + 1.1 * 0.3 + 0.5 * 0.125 + 0.6 * 0.25) * 9.81  # N m of the arm, held out straight
+    assert 0.7 * weight < usual_torques(model, ["shoulder"])[0] < 2.0 * weight
+
+
+def test_measured_torques_count_for_the_scale_too():
+    scene, time = mechanism(), np.linspace(0.0, 1.0, 50)
+    torque = np.full((1, 50, 3), 600.0, np.float32)
+    channel = Channel("torque", "N m", scene.joints, time, torque, np.ones(torque.shape, bool))
+    log = Recording(
+        "log", time, np.zeros((50, 0)), (), {"torque": channel}, TorqueConvention(TorqueSide.MOTOR, True), {}
+    )
+    assert (machine_scale(scene, []), machine_scale(scene, [log])) == (0.3, 10.0)

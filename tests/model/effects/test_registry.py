@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from effect_bench import ARM, JOINTS, MECHANISM, MOTOR, Bench, make_bench, mechanism
+from effect_oracles import OF_THEIR_OWN
 
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
@@ -27,10 +28,9 @@ OF_HINGES = {"angle_friction", "door_closer", "drag", "hardening_spring", "hinge
 OF_ARMS = {"cable_pull", "encoder_offset", "free_payload", "gear_friction", "gravity_direction", "joint_backlash",
            "joint_compliance", "joint_coulomb", "joint_directional", "joint_stribeck", "load_friction", "payload",
            "profile_acceleration", "profile_speed", "servo_gain", "soft_friction", "torque_crosstalk",
-           "torque_ripple", "torque_speed_line", "two_mass_backlash", "two_mass_resonance",
-           "velocity_feedforward"}  # fmt: skip
-OF_SERVOS = {"joint_backlash", "joint_compliance", "torque_speed_line", "two_mass_backlash", "two_mass_resonance"}
-OF_GRIPS = {"contact_compliance"}
+           "torque_ripple", "torque_speed_line", "velocity_feedforward"}  # fmt: skip
+OF_SERVOS = {"joint_backlash", "joint_compliance", "torque_speed_line"}
+OF_GRIPS = {"contact_compliance", *OF_THEIR_OWN}  # neither is in the small scene
 
 
 @pytest.fixture
@@ -141,9 +141,16 @@ def test_motors_have_no_elasticity():
 
 
 def test_a_joint_without_armature_has_no_motor_of_its_own():
-    light = edited('armature="0.02"', "")
-    for effect in library(light, ["two_mass_backlash", "two_mass_resonance"]):
-        assert list(effect.locations) == ["shoulder"]
+    weights = mechanism().spec.copy()
+    for body in weights.bodies:
+        body.gravcomp = 0.0
+    weights.joint("elbow").armature = 0.0
+    effects = library(compile_scene(weights, "light", joints=ARM), list(OF_THEIR_OWN))
+    assert [list(effect.locations) for effect in effects] == [["shoulder"]] * 2
+
+
+def test_a_weight_that_is_compensated_does_not_pass_the_gear():
+    assert not library(mechanism(), list(OF_THEIR_OWN))
 
 
 def test_joints_without_servos_have_no_servo_effects():
