@@ -47,6 +47,7 @@ import tyro  # noqa: E402
 
 from benchmarks.common import CODE, empty_cache, origin, peak_memory_gib, stem  # noqa: E402
 from droid_jax import runtime  # noqa: E402
+from droid_jax.quiet import import_mjx  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 
 SHARES = {"c": 1.0, "jax": 5.0, "warp": 4.0, "fit": 3.0, "ppo": 6.0, "gap": 4.0}  # of the time, in this order
@@ -350,7 +351,7 @@ def run_part(arguments: Arguments) -> None:
     if arguments.part == "c":  # the replay's module imports jax, which need not take the GPU's memory
         os.environ["JAX_PLATFORMS"] = "cpu"
     runtime.tune()
-    runtime.import_mjx()
+    import_mjx()
     now = Measuring(arguments)
     import jax
 

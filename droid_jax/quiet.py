@@ -21,7 +21,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from droid_jax.installation import check_mujoco
 
@@ -74,6 +74,23 @@ def import_mjx() -> ModuleType:
         mjx = importlib.import_module("mujoco.mjx")
     quiet_cache()
     return mjx
+
+
+class _WhenUsed:
+    """mujoco.mjx, imported (`import_mjx`) when something of it is first used; plain C needs nothing of it."""
+
+    @functools.cached_property
+    def _module(self) -> ModuleType:
+        return import_mjx()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+
+if TYPE_CHECKING:
+    import mujoco.mjx as mjx
+else:
+    mjx = _WhenUsed()
 
 
 def before_jax() -> None:

@@ -27,7 +27,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from droid_jax import distributed
-from droid_jax.quiet import before_jax, import_mjx, quiet_cache
+from droid_jax.installation import check_mujoco
+from droid_jax.quiet import before_jax, quiet_cache
 from droid_jax.quiet import quiet as quiet
 from droid_jax.storage import write_json
 
@@ -221,10 +222,16 @@ def _granted(group: Path) -> list[float]:
 
 @functools.cache
 def start() -> None:
-    """Tune, import jax and MJX, and print a line, since it takes seconds; only the first call does anything."""
+    """Tune, import jax, and print a line, since it takes seconds; only the first call does anything.
+
+    MJX is imported when it is first used, which fits in plain C do not.
+    """
     print("starting jax ...", flush=True)
     tune()
-    import_mjx()
+    before_jax()
+    check_mujoco()
+    importlib.import_module("jax")
+    quiet_cache()
 
 
 def _leave_shardy() -> None:

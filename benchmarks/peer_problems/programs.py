@@ -26,7 +26,6 @@ import numpy as np
 from droid_jax import runtime
 
 runtime.tune()
-runtime.import_mjx()
 
 from droid_jax.cost.cost import make_cost  # noqa: E402
 from droid_jax.cost.residuals import CompareConfig  # noqa: E402

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.quiet_mjx import mjx
+from droid_jax.quiet import mjx
 from droid_jax.runtime import first_device
 
 

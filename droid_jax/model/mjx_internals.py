@@ -21,23 +21,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import importlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from types import ModuleType
 from typing import Any, NamedTuple, cast
 
-from droid_jax.model.quiet_mjx import mjx
-
-# isort: split
 import jax
 import jax.numpy as jnp
-import mujoco.mjx._src.constraint as _constraint
-import mujoco.mjx._src.math as _math
+
+from droid_jax.quiet import import_mjx, mjx
 
 # Module and name of a function of mjx, looked up at each call, so that it can be replaced.
-Replaced = tuple[ModuleType, str]
-SEGMENT_POINT: Replaced = (_math, "closest_segment_point")  # a, b, p [3] m -> the point of the segment a-b closest to p
-CONSTRAINT_LAW: Replaced = (_constraint, "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
+Replaced = tuple[str, str]
+SEGMENT_POINT: Replaced = (
+    "math",
+    "closest_segment_point",
+)  # a, b, p [3] m -> the point of the segment a-b closest to p
+CONSTRAINT_LAW: Replaced = ("constraint", "_kbi")  # model, solref, solimp, position -> stiffness, damping, impedance
 
 
 class ConstraintRows(NamedTuple):
@@ -73,6 +74,13 @@ class Contacts(NamedTuple):
     geoms: jax.Array
     distance: jax.Array
     first_row: jax.Array
+
+
+@functools.cache
+def private(module: str) -> ModuleType:
+    """A private module of mjx, imported when it is first used."""
+    import_mjx()
+    return importlib.import_module(f"mujoco.mjx._src.{module}")
 
 
 def constraint_rows(data: Any) -> ConstraintRows:
@@ -122,7 +130,7 @@ def has_fluid(model: Any) -> Any:
 
 def quat_multiply(one: jax.Array, other: jax.Array) -> jax.Array:
     """[4] product of two quaternions (w, x, y, z)."""
-    return _math.quat_mul(one, other)
+    return private("math").quat_mul(one, other)
 
 
 def array_fields() -> frozenset[str]:
@@ -163,9 +171,9 @@ def _switched(target: Replaced, new: Callable[[Callable], Callable]) -> ContextV
 
     new: original -> the function while the switch is on.
     """
-    module, name = target
+    module, name = private(target[0]), target[1]
     original = getattr(module, name)
-    if (existing := getattr(original, "switch", None)) is not None:  # this module was loaded a second time
+    if (existing := getattr(original, "switch", None)) is not None:  # by another thread, or this module's first load
         return existing
     switch = ContextVar(name, default=False)
     other = new(original)
@@ -179,21 +187,27 @@ def _switched(target: Replaced, new: Callable[[Callable], Callable]) -> ContextV
     return switch
 
 
-_SEGMENTS = _switched(SEGMENT_POINT, lambda original: closest_segment_point)
-_MIDPOINT = _switched(CONSTRAINT_LAW, midpoint_law)
+@functools.cache
+def _segments() -> ContextVar[bool]:
+    return _switched(SEGMENT_POINT, lambda original: closest_segment_point)
+
+
+@functools.cache
+def _midpoint() -> ContextVar[bool]:
+    return _switched(CONSTRAINT_LAW, midpoint_law)
 
 
 @contextlib.contextmanager
 def exact_segments() -> Iterator[None]:
     """While active, traces of mjx's capsule contacts in this thread use the unbiased closest point."""
-    with _on(_SEGMENTS):
+    with _on(_segments()):
         yield
 
 
 @contextlib.contextmanager
 def midpoint_constraints() -> Iterator[None]:
     """While active, traces of mjx's constraints in this thread are damped with the mean velocity of the step."""
-    with _on(_MIDPOINT):
+    with _on(_midpoint()):
         yield
 
 

@@ -20,9 +20,9 @@ import numpy as np
 from droid_jax.model.inertia import PSEUDO_INERTIA, as_written, check_single_inertia, inertial_fields, nominal_field
 from droid_jax.model.mjx_internals import array_fields, quat_multiply, tendon_jacobian
 from droid_jax.model.parameters import Space, Write
-from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import IGNORED
+from droid_jax.quiet import mjx
 from droid_jax.runtime import first_device
 
 # Fields from which the compiler derives others.

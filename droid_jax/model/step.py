@@ -32,8 +32,8 @@ from droid_jax.model.mjx_internals import (
     with_constraint_force,
 )
 from droid_jax.model.normal_equations import normal_equations
-from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.unsupported_features import check_options
+from droid_jax.quiet import mjx
 
 ITERATIONS = 8  # most Newton iterations; two or three are usual from a warm start
 LINE_SEARCH = 6  # iterations of a line search, each at a corner of the piecewise linear slope

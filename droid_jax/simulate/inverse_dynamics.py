@@ -17,9 +17,9 @@ from droid_jax.model.encoders import encoder_error, misplaced_weight
 from droid_jax.model.gravity import field_force
 from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
-from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.unsupported_features import refuse_fluid
+from droid_jax.quiet import mjx
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.runtime import first_device
 from droid_jax.simulate.closed_loops import coupled_to_others

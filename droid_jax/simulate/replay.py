@@ -23,10 +23,10 @@ from droid_jax.model.encoders import encoder_error, misplaced_compensation
 from droid_jax.model.mjx_internals import Contacts, constraint_rows, contacts
 from droid_jax.model.parameters import Role
 from droid_jax.model.physics import Physics
-from droid_jax.model.quiet_mjx import mjx
 from droid_jax.model.scene import Scene
 from droid_jax.model.step import servo_force
 from droid_jax.model.unsupported_features import check_options
+from droid_jax.quiet import mjx
 from droid_jax.recordings.checks import check_joints
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide

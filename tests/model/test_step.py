@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows, exact_segments, midpoint_law
+from droid_jax.model.mjx_internals import CONSTRAINT_LAW, constraint_rows, exact_segments, midpoint_law, private
 from droid_jax.model.normal_equations import UNROLLED, normal_equations
 from droid_jax.model.step import simulate_step, solve
 from droid_jax.model.unsupported_features import check_options
@@ -437,7 +437,7 @@ def _half_back(model: mujoco.MjModel, h: float) -> np.ndarray:
 
 def test_midpoint_law_follows_its_equation():
     """J a = (-b v - k d r - R f) / (1 + b h / 2): damping, stiffness x impedance and R."""
-    model, own_law = mjx.put_model(arm()), getattr(*CONSTRAINT_LAW)
+    model, own_law = mjx.put_model(arm()), getattr(private(CONSTRAINT_LAW[0]), CONSTRAINT_LAW[1])
     solref, solimp, position = jnp.array([0.02, 1.0]), jnp.array([0.9, 0.95, 0.001, 0.5, 2.0]), jnp.array(-4e-4)
     k, b, d = own_law(model, solref, solimp, position)
     new_k, new_b, new_d = midpoint_law(own_law)(model, solref, solimp, position)

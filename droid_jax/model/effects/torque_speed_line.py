@@ -35,8 +35,8 @@ def torque_speed_line(scene: Scene) -> Effect | None:
         every = jnp.tile(none, (len(state.model.actuator_gear), 1))
         return every.at[servos.actuators].set(jnp.where(inverse[:, None] > 0.0, jnp.sort(ends, axis=1), none))
 
-    rubbing = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
-    usual = dict(zip(servos.joints, usual_torques(scene, servos.joints) + rubbing, strict=True))
+    friction = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
+    usual = dict(zip(servos.joints, usual_torques(scene, servos.joints) + friction, strict=True))
     of_joints = (a.coefficient(f"{LINE}[{j}]", "1/(N m)", 6.0 / t, 30.0 / t, low=0.0) for j, t in usual.items())
     return Effect(
         LINE,
