@@ -192,7 +192,10 @@ class DiscrepancyConfig:
 
     search: CmaConfig = field(default_factory=lambda: CmaConfig(parents=None, generations=20))
     refine: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=CONVERGE_ITERATIONS))
-    refit: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0))
+    # A joint that sticks makes slopes of little use: one iteration that gains nothing says too little.
+    refit: RefineConfig = field(
+        default_factory=lambda: RefineConfig(iterations=20, basin_hops=0, spreads=0, patience=2)
+    )
     one_step: LevenbergMarquardtConfig = field(
         default_factory=lambda: replace(LevenbergMarquardtConfig(), **FEWER_TRIALS)
     )
