@@ -19,7 +19,7 @@ from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.c_engine import instrument, split
-from droid_jax.simulate.compiled import compiled_replay
+from droid_jax.simulate.compiled import compiled_replay, window_program
 from droid_jax.simulate.replay import Drive, servo_replay
 from droid_jax.synthetic import hooks
 from droid_jax.synthetic.drive_effects import GEAR_DAMPING
@@ -171,6 +171,26 @@ def test_neutral_is_the_rigid_gear_and_both_act():
     neutral, elastic, loose = positions(scene, space, np.stack([*rows, rows[0]]), command)[:3]
     np.testing.assert_allclose(neutral, np.asarray(bare.position)[0, :, 0], atol=2e-6)
     assert np.abs(elastic - neutral).max() > 1e-3 < np.abs(loose - neutral).max()
+
+
+@pytest.mark.parametrize("values", [{f"{RESONANCE}[j]": 5e-3}, {f"{BACKLASH}[j]": 0.02}])
+def test_a_window_begins_where_the_motion_is(values: dict[str, float]):
+    """From recorded positions and speeds: the state of the gear follows from the servo's torque."""
+    scene, time = rigid(0.6), np.arange(800) * STEP
+    command, first, steps = 0.4 * np.sin(6.0 * time), 300, 200
+    effects, space = library(scene, [RESONANCE, BACKLASH]), two_masses(scene)
+    drive = Drive(command[:, None], np.zeros(1), STEP, TorqueConvention(TorqueSide.MOTOR, gravity=True))
+    rows = np.tile(space.values(values), (2, 1))
+    whole = compiled_replay("mjx", scene, space, drive, effects)(rows)
+    position, velocity = (np.asarray(trace)[0, :, 0] for trace in (whole.position, whole.velocity))
+    window = window_program(scene, space, drive, effects, 0, steps)
+    early = 0.5 * (velocity[first - 1] + velocity[first])  # half a step before the position
+    begin, speed = np.full((2, 1), position[first]), np.full((2, 1), early)
+    table = np.tile(command[first : first + steps, None], (2, 1, 1))
+    found = window(rows, table, begin, np.ones((2, 1, 2)), speed, np.full(2, time[first]))
+    twist = values.get(f"{RESONANCE}[j]", 0.0) * np.abs(np.asarray(whole.torque)[0]).max()
+    off = np.abs(np.asarray(found.position)[0, :, 0] - position[first : first + steps]).max()
+    assert off < 0.1 * max(twist, values.get(f"{BACKLASH}[j]", 0.0))
 
 
 def test_the_replay_has_forward_derivatives():
