@@ -35,6 +35,7 @@ _OF_THE_CACHE = re.compile(
     rb"|pjrt_executable\.cc.* Assume version compatibility\. PjRt-IFRT does not track XLA executable versions"
 )
 _lock = threading.Lock()
+_first = threading.RLock()
 _settled: list[str] = []  # the log level that jaxlib was loaded with, where this package set it
 
 
@@ -79,12 +80,14 @@ def import_mjx() -> ModuleType:
 class _WhenUsed:
     """mujoco.mjx, imported (`import_mjx`) when something of it is first used; plain C needs nothing of it."""
 
-    @functools.cached_property
-    def _module(self) -> ModuleType:
-        return import_mjx()
-
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._module, name)
+        return getattr(_mjx(), name)
+
+
+def _mjx() -> ModuleType:
+    """mujoco.mjx, imported by one thread: `quiet` replaces the standard output of all meanwhile."""
+    with _first:
+        return sys.modules.get("mujoco.mjx") or import_mjx()
 
 
 if TYPE_CHECKING:

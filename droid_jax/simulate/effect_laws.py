@@ -83,11 +83,13 @@ def step_with_effects(
     before = template.replace(qpos=moving.qpos, qvel=moving.qvel, qacc_warmstart=moving.warm, ctrl=ctrl)
     push = apply_forces(theta, state, effects, error, gears)
     after = simulate_step(used, before, parity=parity, servo_damping=servo_damping, push=push)
-    torques, load = moving.gear, after.qfrc_actuator if gears is None else after.qfrc_actuator + gears.push
+    motors, load, torques = moving.motors, after.qfrc_actuator, moving.gear
+    if gears is not None:
+        motors = gears.after((after.qvel - moving.qvel) / model.opt.timestep)
+        load = load + gears.reading(motors)[2]
     if changes_friction(effects):
         torques = gear_torques(used, after, moving.qvel)
         torques = torques if gears is None else torques + jnp.stack([gears.push, -gears.push])
-    motors = moving.motors if gears is None else gears.after((after.qvel - moving.qvel) / model.opt.timestep)
     carried = Moving(after.qpos, after.qvel, after.qacc_warmstart, load, torques, motors)
     return Stepped(after, carried, used, gears)
 
@@ -145,9 +147,12 @@ def apply_limits(model, theta: Theta, state: State, effects: Sequence[Effect]):
         return model
     own = np.asarray(model.actuator_forcelimited, bool)[:, None]
     ranges: jax.Array = jnp.where(own, jnp.asarray(model.actuator_forcerange), jnp.array([-jnp.inf, jnp.inf]))
+    low, high = ranges[:, 0], ranges[:, 1]
+    of_motors = replace(state, qvel=state.qvel + state.motors[1])  # a motor behind its gear has its own speed
     for law in laws:
-        ends = law(theta, state)
-        ranges = jnp.stack([jnp.maximum(ranges[:, 0], ends[:, 0]), jnp.minimum(ranges[:, 1], ends[:, 1])], axis=1)
+        ends = law(theta, of_motors)
+        low, high = jnp.clip(ends[:, 0], low, high), jnp.clip(ends[:, 1], low, high)
+    ranges = jnp.stack([low, high], axis=1)
     return model.replace(actuator_forcelimited=np.ones(len(own), bool), actuator_forcerange=ranges)
 
 

@@ -7,6 +7,7 @@ does not say what was hidden.  The formulas are in `hinge_effects`, `friction_ef
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -77,7 +78,11 @@ LIBRARY = {
 }
 # Effect of the library -> its name on the object's hinge.
 ON_HINGE = {"joint_stribeck": "hinge_stribeck", "joint_directional": "hinge_directional"}
-OWN_MOTOR = ("resonance", "free_play")
+OWN_MOTOR = ("resonance", "free_play")  # whose motors are simulated by themselves
+# What would have to act on those motors.
+BESIDE_NONE = frozenset(
+    {*OWN_MOTOR, "servo_gains", "joint_elasticity", "torque_line", "load_friction", "mesh_friction", "encoder_zero"}
+)
 LONGEST_STEP = 0.00025  # s, for a stable integration of the explicit torques of hidden effects
 PAUSE = 5.0  # s between repeats, for effects that warm up or drift
 
@@ -135,7 +140,8 @@ def record_hidden(
     applied = as_applied(effects)
     for one in applied:
         check(one, scene)
-    # A motor that is simulated by itself comes first: what others do to commands and sensors, they do to its own.
+    _check_motors(applied)
+    # A motor that is simulated by itself comes first: what other effects do to its sensors, they do to its readings.
     applied = sorted(applied, key=lambda one: one.name not in OWN_MOTOR)
     synthetic_robot = set_up(scene, demonstration, truth, seed=seed, config=config, space=space)
     rows, gears, sensors, synthetic_robot = _simulate(synthetic_robot, applied)
@@ -170,6 +176,17 @@ def in_words(hide: Sequence[str]) -> str:
         library = f"in the library: {label(in_library).lower()}" if in_library else "not in the library"
         phrases.append(f"{label(name).lower()} ({size}; {library})")
     return enumerated(phrases)
+
+
+def _check_motors(applied: Sequence[Applied]) -> None:
+    """Raise ValueError for effects that would have to act on a motor that another one simulates."""
+    for alone, other in itertools.permutations(applied, 2):
+        meet = not alone.joint or not other.joint or alone.joint == other.joint
+        if alone.name in OWN_MOTOR and other.name in BESIDE_NONE and meet:
+            raise ValueError(
+                f"hidden effects {alone.name!r} and {other.name!r} cannot act on one joint: the first one simulates "
+                "its motor, without the other"
+            )
 
 
 def hidden_effect(name: str) -> Hidden:

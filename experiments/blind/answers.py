@@ -87,10 +87,10 @@ ANSWERS: dict[str, Answer] = {
         "", why="a play that the command leads; joint_backlash follows the load and explains none of it", scenes=SERVO
     ),
     "resonance": Answer(
-        "two_mass_resonance", ("joint_compliance", "servo_gain"), "slow motions show the gear's twist alone", SERVO
+        "two_mass_resonance", ("joint_compliance", "servo_gain"), "slow motions show the gear's twist alone", ("bench",)
     ),
     "free_play": Answer(
-        "two_mass_backlash", ("joint_backlash",), "a motor that crosses the gap at once has no state", SERVO
+        "two_mass_backlash", ("joint_backlash",), "a motor that crosses the gap at once has no state", ("bench",)
     ),
     "torque_line": Answer("torque_speed_line", scenes=SERVO),
     "servo_gains": Answer(

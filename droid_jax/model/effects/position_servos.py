@@ -46,9 +46,10 @@ class PositionServos:
         gain, bias = self.law(state)
         length, speed = self.gear * state.qpos[self.positions], self.gear * state.qvel[self.dofs]
         feedback = bias[:, 0] + bias[:, 1] * length + bias[:, 2] * speed
-        given, limited = ctrl[self.actuators], np.asarray(state.model.actuator_ctrllimited, bool)[self.actuators]
-        if limited.any():
-            low, high = state.model.actuator_ctrlrange[self.actuators].T
+        model, given = state.model, ctrl[self.actuators]
+        limited = np.asarray(model.actuator_ctrllimited, bool)[self.actuators]
+        if limited.any() and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+            low, high = model.actuator_ctrlrange[self.actuators].T
             given = jnp.where(limited, jnp.clip(given, low, high), given)
         return jnp.asarray(self.gear) * (gain * given + feedback)
 

@@ -1,6 +1,6 @@
 """A servo's torque limit that falls with speed: a DC motor at its full voltage.
 
-With stall torque T and no-load speed W the motor gives torques between -T (1 + w / W) and T (1 - w / W).  Back
+With stall torque T the motor gives torques between -T - D w and T - D w, D = T / W for a no-load speed W.  Back
 electromotive force that is part of the joint's damping in the MJCF needs no slope (`model.dc_motor`).
 """
 
@@ -16,28 +16,36 @@ from droid_jax.model.effects.registry import register
 from droid_jax.model.scene import Scene
 
 LINE, SLOPE = "torque_speed_line", "torque_speed_slope"
-SLOPES = (0.0, 0.2)  # s/rad, one over the no-load speed
+SLOPES = (0.0, 0.2)  # s/rad
 LEAST = 1e-6  # 1/(N m), of a limit that is finite
 USUAL_SPEED = 1.0  # rad/s, of motions that are recorded
 
 
 @register
 def torque_speed_line(scene: Scene) -> Effect | None:
-    """Torques between -(1/p) (1 + s w) and (1/p) (1 - s w), p in 1/(N m) for each joint and s in s/rad for all."""
+    """Torques between -1/p - s t w and 1/p - s t w; p in 1/(N m) for each joint, s in s/rad for all.
+
+    t is a usual torque of the joint, so that s is one over the speed at which the limit has fallen by as much.
+    """
     servos = arm_servos(scene)
     if servos is None:
         return None
 
+    friction = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
+    usual = usual_torques(scene, servos.joints) + friction
+
     def limits(theta, state):
-        inverse, fall = column(theta, LINE, servos.joints), a.value(theta, SLOPE) * state.qvel[servos.dofs]
-        stall, none = 1.0 / jnp.maximum(inverse, LEAST), jnp.array([-jnp.inf, jnp.inf])
-        ends = jnp.stack([-stall * (1.0 + fall), stall * (1.0 - fall)], axis=1) / servos.gear[:, None]
+        inverse, none = column(theta, LINE, servos.joints), jnp.array([-jnp.inf, jnp.inf])
+        stall = 1.0 / jnp.maximum(inverse, LEAST)
+        fall = a.value(theta, SLOPE) * jnp.asarray(usual, jnp.float32) * state.qvel[servos.dofs]
+        ends = jnp.stack([-stall - fall, stall - fall], axis=1) / servos.gear[:, None]
         every = jnp.tile(none, (len(state.model.actuator_gear), 1))
         return every.at[servos.actuators].set(jnp.where(inverse[:, None] > 0.0, jnp.sort(ends, axis=1), none))
 
-    friction = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
-    usual = dict(zip(servos.joints, usual_torques(scene, servos.joints) + friction, strict=True))
-    of_joints = (a.coefficient(f"{LINE}[{j}]", "1/(N m)", 6.0 / t, 30.0 / t, low=0.0) for j, t in usual.items())
+    of_joints = (
+        a.coefficient(f"{LINE}[{joint}]", "1/(N m)", 6.0 / torque, 30.0 / torque, low=0.0)
+        for joint, torque in zip(servos.joints, usual.tolist(), strict=True)
+    )
     return Effect(
         LINE,
         (*of_joints, a.shape(SLOPE, "s/rad", SLOPES, 0.0, 1.0)),
@@ -47,5 +55,5 @@ def torque_speed_line(scene: Scene) -> Effect | None:
         confused_with=("profile_acceleration", "profile_speed", "servo_gain", "joint_compliance"),
         locations=a.locations(servos.joints, LINE),
         shape_parameters={SLOPE: SLOPES},
-        minimum_size=0.4 / max(usual.values()),
+        minimum_size=0.4 / float(max(usual)),
     )

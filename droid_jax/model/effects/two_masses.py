@@ -146,10 +146,14 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
     inertia = jnp.maximum(model.dof_armature[dofs], LEAST_INERTIA)
     stiffness, damping = servos.stiffness_in(state), servos.damping_in(state)
     rigid = servos.rigid_torque(state, ctrl)
-    # A servo at its limit gives that limit: the constant part of its law is what makes it so amid the step.
-    own_lead = stiffness * (lead + 0.5 * timestep * speed) + damping * speed
-    now, (low, high) = rigid - own_lead, servos.limits_in(state)
-    torque = jnp.where((now > low) & (now < high), rigid, jnp.clip(now, low, high) + own_lead)
+    low, high = servos.limits_in(state)
+    # A servo at its limit gives that limit, whatever its gains.  What it would give is asked of the middle of the step.
+    ahead = (2.0 * inertia / timestep) * speed - stiffness * lead + rigid - inertia * acceleration
+    ahead = ahead / (2.0 * inertia / timestep + 0.5 * timestep * stiffness + damping)
+    middle = rigid - stiffness * (lead + 0.5 * timestep * ahead) - damping * ahead
+    free_running = (middle > low) & (middle < high)
+    torque = jnp.where(free_running, rigid, jnp.clip(middle, low, high))
+    stiffness, damping = (jnp.where(free_running, gain, jnp.zeros_like(gain)) for gain in (stiffness, damping))
 
     # Contact or free.  A rigid contact lasts while the motor, left alone, would go further.
     is_rigid = compliance <= LEAST_COMPLIANCE
@@ -170,11 +174,13 @@ def _step(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -
     force: jax.Array = jnp.where(
         hard, inertia * speed / timestep + torque - stiffness * end, spring * (lead - end) + share * pull
     )
-    push = force - jnp.clip(rigid + (1.0 - share) * damping * state.qvel[dofs], low, high)
+    # What the actuators give with the velocity gains below, at the velocity before the step.
+    own = servos.damping_in(state) - share * damping
+    push = force - jnp.clip(rigid + own * state.qvel[dofs], low, high)
     armature, bias = model.dof_armature, model.actuator_biasprm
     geared = model.replace(
         dof_armature=armature.at[dofs].set(armature[dofs] * share),
-        actuator_biasprm=bias.at[actuators, 2].set(bias[actuators, 2] * share),
+        actuator_biasprm=bias.at[actuators, 2].set(-share * damping / servos.gear**2),
     )
 
     def after(qacc: jax.Array) -> jax.Array:

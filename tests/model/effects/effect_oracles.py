@@ -22,6 +22,7 @@ CARRIED = 1.1 * 0.3  # kg m about the shoulder, of their mass at the elbow
 UPPER_ARM = 1.5 * 0.15 + CARRIED
 
 
+USUAL = {"shoulder": 9.54755721, "elbow": 3.5224549}  # N m: weight, inertia at 5 rad/s^2, damping at 1 rad/s
 STIFFNESS = {"shoulder": 80.0, "elbow": 40.0}  # N m/rad
 OF_THEIR_OWN = ("two_mass_backlash", "two_mass_resonance")  # effects with a state: see test_two_masses.py
 
@@ -251,8 +252,8 @@ def stretch(joint: str, now: Now) -> float:
 
 def at_most(v: Values, joint: str, now: Now) -> float:
     """N m that a motor at its full voltage gives of what its servo asks for; v without the joint's name."""
-    stall, fall = 1.0 / v["torque_speed_line"], v["torque_speed_slope"] * now.w[joint]
-    return float(np.clip(STIFFNESS[joint] * now.ahead[joint], -stall * (1.0 + fall), stall * (1.0 - fall)))
+    stall, fall = 1.0 / v["torque_speed_line"], v["torque_speed_slope"] * USUAL[joint] * now.w[joint]
+    return float(np.clip(STIFFNESS[joint] * now.ahead[joint], -stall - fall, stall - fall))
 
 
 ORACLES = {

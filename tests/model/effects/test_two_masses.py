@@ -114,12 +114,6 @@ def test_a_resonance_is_that_of_two_bodies_in_c(compliance: float, ratio: float,
     got, force = replayed(rigid(kv), values, command, start=motor[0])
     stiff, _ = replayed(rigid(kv), {}, command, start=motor[0])
     assert np.ptp(motor - link) > 0.03  # rad: it vibrates
-    print(
-        "R",
-        compliance,
-        np.abs(got - motor).max() / np.abs(stiff - motor).max(),
-        np.abs(force - torque).max() / np.abs(torque).max(),
-    )
     assert np.abs(got - motor).max() < 0.025 * np.abs(stiff - motor).max()
     assert np.abs(force - torque).max() < 0.025 * np.abs(torque).max()
     _, spring = replayed(rigid(kv), values, command, start=motor[0], side=TorqueSide.LINK)
@@ -206,9 +200,10 @@ def test_the_replay_has_forward_derivatives():
     np.testing.assert_allclose(slope, (more - less) / 2e-4, atol=0.02 * np.abs(slope).max())
 
 
-def test_a_servo_at_its_limit_turns_its_motor_with_that_torque():
-    """In the backlash, where nothing else acts on the motor."""
-    scene = rigid(0.0, limit=2.0)
+@pytest.mark.parametrize("kv", [0.0, 0.5, 4.0])
+def test_a_servo_at_its_limit_turns_its_motor_with_that_torque(kv: float):
+    """In the backlash, where nothing else acts on the motor; a servo at its limit does not damp."""
+    scene = rigid(kv, limit=2.0)
     command = np.full(round(0.1 / STEP), 0.5 * np.pi)  # hanging at rest
     begin = len(command) // 2
     command[begin:] += 0.4  # kp times 0.4 rad is far above the limit
