@@ -17,6 +17,7 @@ LENGTHS = (("(N m)", "N"), (TORQUE, "N"), ("rad", "m"), ("turn", "(2 pi m)"))  #
 
 PANDA = 54.0  # N m, the largest of a Panda's `usual_torques`
 FINEST = 2  # steps of a scale in a decade
+FRICTION_SHARE = 10.0  # of torques, of a small machine in that of a Panda
 POSES = 20  # in which a joint's weight is computed
 AT_MOST = 1.0  # rad (m) from the model's own pose, in these poses
 USUAL_ACCELERATION = 5.0  # rad/s^2 (m/s^2), of motions that are recorded
@@ -39,10 +40,13 @@ def scale_of(largest: float) -> float:
     """The scale of the library for a machine whose largest torque this is, N m (N): 1 for one like a Panda.
 
     In half decades (0.1, 0.3, 1, 3), rounded towards 1, so that it does not depend on details of a model or a log.
+    Friction of a small machine is a larger share of its torques (a hobby servo's up to a half of what it lifts): the
+    scale falls from a tenth of a Panda's torque on.
     """
     if largest <= 0.0:
         return 1.0
-    steps = int(FINEST * np.log10(largest / PANDA))
+    ratio = largest / PANDA
+    steps = int(FINEST * np.log10(ratio if ratio > 1.0 else min(FRICTION_SHARE * ratio, 1.0)))
     return float(f"{10.0 ** (steps / FINEST):.1g}")
 
 

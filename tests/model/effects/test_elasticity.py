@@ -140,7 +140,7 @@ def test_a_motor_at_its_full_voltage_stays_on_its_line(kv: float, timestep: floa
 
 
 def test_the_scale_of_a_machine_is_rounded_towards_a_panda():
-    assert [scale_of(x) for x in (0.0, 54.0, 20.0, 150.0, 200.0, 5.0, 0.9)] == [1.0, 1.0, 1.0, 1.0, 3.0, 0.1, 0.03]
+    assert [scale_of(x) for x in (0.0, 54.0, 20.0, 150.0, 200.0, 5.0, 0.9)] == [1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 0.3]
     assert machine_scale(door_scene(springs=1), []) == 1.0
     model = mechanism()
     weight = (1.5 * 0.15 + 1.1 * 0.3 + 0.5 * 0.125 + 0.6 * 0.25) * 9.81  # N m of the arm, held out straight
@@ -154,4 +154,4 @@ def test_measured_torques_count_for_the_scale_too():
     log = Recording(
         "log", time, np.zeros((50, 0)), (), {"torque": channel}, TorqueConvention(TorqueSide.MOTOR, True), {}
     )
-    assert (machine_scale(scene, []), machine_scale(scene, [log])) == (0.3, 10.0)
+    assert (machine_scale(scene, []), machine_scale(scene, [log])) == (1.0, 10.0)
