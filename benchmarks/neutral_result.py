@@ -164,13 +164,12 @@ def replayed(fitted: Any, recording: Any, effects: tuple[Any, ...], runs: Path) 
     import jax.numpy as jnp
 
     from droid_jax import runtime
+    from droid_jax.model.effect_interface import MOVING, has_law
     from droid_jax.model.physics import make_physics
     from droid_jax.simulate.replay import make_drive, servo_replay
 
     drive = make_drive(fitted.scene, recording, weigh=False)
-    laws = sorted(
-        e.name for e in effects if e.profile or e.command or e.servo or e.limits or e.gear or e.force or e.frictionloss
-    )
+    laws = sorted(e.name for e in effects if has_law(e, MOVING))
     numbers = hashlib.sha256(np.asarray(fitted.after).tobytes() + recording.sha256.encode() + str(laws).encode())
     kept = runs / f"{numbers.hexdigest()[:16]}.npz"
     if kept.is_file():

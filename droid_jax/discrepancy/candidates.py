@@ -19,7 +19,7 @@ from scipy.optimize import lsq_linear
 
 from droid_jax.discrepancy.case import ResidualSet
 from droid_jax.discrepancy.statistics import largest_trend
-from droid_jax.model.effect_interface import Effect, Rollout
+from droid_jax.model.effect_interface import MOVING, STEERING, Effect, Rollout, has_law
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of
 from droid_jax.model.effects.effect_scaling import scale_of, usual_torques
 from droid_jax.model.effects.registry import library
@@ -71,8 +71,7 @@ def shows_in(effect: Effect, scene: Scene, channels: Iterable[str]) -> bool:
     An effect that moves the robot can change all of them.  A sensor model is tried on a random motion: a torque offset
     does not show in positions.
     """
-    moves = effect.command or effect.servo or effect.limits or effect.gear or effect.force or effect.frictionloss
-    if moves or effect.observe is None or any(p.writes for p in effect.parameters):
+    if has_law(effect, MOVING) or effect.observe is None or any(p.writes for p in effect.parameters):
         return True
     rng = np.random.default_rng(0)
     torque, position, velocity = rng.normal(size=(3, SAMPLES, len(scene.joints)))
@@ -90,11 +89,10 @@ def acts_on_commands_only(effect: Effect) -> bool:
     This includes effects without functions whose parameters write only model fields of these (`servo_gain`,
     `soft_friction`).
     """
-    if effect.profile or effect.command or effect.servo or effect.limits or effect.gear:
+    if has_law(effect, STEERING):
         return True
     fields = [w.field for p in effect.parameters for w in p.writes]
-    laws = (effect.force, effect.frictionloss, effect.observe)
-    acts = any(laws) or not all(p.writes for p in effect.parameters)
+    acts = has_law(effect, ("force", "frictionloss", "observe")) or not all(p.writes for p in effect.parameters)
     return bool(fields) and not acts and all(field.startswith(ACT_ON_COMMANDS) for field in fields)
 
 

@@ -156,7 +156,7 @@ class DoorEnv(Environment):
             model, theta, error, world = sample
             moving, _ = carry
             now = moving.state(world.time + number * self._timestep, model)
-            after, moving, _, _ = step_with_effects(
+            after, moving, *_ = step_with_effects(
                 self._template,
                 model,
                 theta,

@@ -20,7 +20,7 @@ from droid_jax.arguments import instance, path_of, shown
 from droid_jax.files import EXTENDED, EXTENDED_MJCF
 from droid_jax.identify.gaussian import Coordinates, Gaussian, ParameterEntry, matrix, space_of, space_to_json
 from droid_jax.identify.neutral_result import write_neutral
-from droid_jax.model.effect_interface import LAWS, Effect
+from droid_jax.model.effect_interface import MOVING, Effect, has_law
 from droid_jax.model.effects.candidate import Candidate, Keys
 from droid_jax.model.effects.registry import effect_space, library, ready
 from droid_jax.model.fields import check_space
@@ -129,9 +129,8 @@ def _read(path: Path) -> _File:
 
 def _in_mjcf(effect: Effect, free: Space) -> bool:
     """Whether an effect only writes numbers of the model that MJCF has attributes for; free: its free parameters."""
-    laws = (getattr(effect, law) for law in LAWS if law != "native")
     fields = [{w.field for w in p.writes} for p in free.parameters]
-    return not any(laws) and all(written and written <= WORDS for written in fields)
+    return not has_law(effect, (*MOVING, "observe")) and all(written and written <= WORDS for written in fields)
 
 
 class _Effect(msgspec.Struct, forbid_unknown_fields=True):

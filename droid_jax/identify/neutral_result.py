@@ -19,7 +19,7 @@ import numpy as np
 from droid_jax.files import APPLY_FIT, FITTED_JSON, MJLAB_TERMS
 from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
-from droid_jax.model.effect_interface import Effect
+from droid_jax.model.effect_interface import MOVING, Effect, has_law
 from droid_jax.model.inertia import PSEUDO_INERTIA, TERMS, WEIGHTS, root_of
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.mjcf import FittedFiles, field_unit, fitted_files, is_angle, mjcf_attribute, native, unwritten
@@ -115,7 +115,7 @@ def neutral_json(
     intervals = dict(zip(space.names, np.stack(gaussian.interval(0.9), axis=1).tolist(), strict=True))
     priors = dict(zip(space.names, np.stack(prior(space).interval(0.9), axis=1).tolist(), strict=True))
     deviations = dict(zip(space.names, gaussian.physical_std.tolist(), strict=True))
-    laws = [e for e in effects if e.profile or e.command or e.servo or e.limits or e.gear or e.force or e.frictionloss]
+    laws = [e for e in effects if has_law(e, MOVING)]
     fitted = (
         with_numbers(scene, space, np.asarray(values)) if laws else None
     )  # MJX may not support a scene without laws

@@ -166,17 +166,15 @@ class Effect:
     over_time: bool = False
 
 
-LAWS = (
-    "profile",
-    "command",
-    "servo",
-    "limits",
-    "gear",
-    "force",
-    "frictionloss",
-    "observe",
-    "native",
-)  # fields with functions
+# Fields with functions: what acts on commands and servos, what moves the robot, and all of them.
+STEERING = ("profile", "command", "servo", "limits", "gear")
+MOVING = (*STEERING, "force", "frictionloss")
+LAWS = (*MOVING, "observe", "native")
+
+
+def has_law(effect: Effect, laws: Sequence[str]) -> bool:
+    """Whether an effect has one of these laws."""
+    return any(getattr(effect, law) is not None for law in laws)
 
 
 def complete(theta: Theta, effects: Sequence[Effect]) -> Theta:

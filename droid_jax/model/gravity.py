@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from droid_jax.model.physics import moved_bodies
 from droid_jax.quiet import mjx
 from droid_jax.runtime import first_device
 
@@ -54,7 +55,7 @@ def field_force(model: Any, pose: Any, mass: jax.Array, field: jax.Array) -> jax
     Returns:
         [nv] N m (N for slides): the sum of J^T m field over the bodies, J that of each one's centre of mass.
     """
-    below = jnp.asarray(_moved(model), mass.dtype)  # [nbody, nv]
+    below = jnp.asarray(moved_bodies(model), mass.dtype)  # [nbody, nv]
     arm = pose.xipos - pose.subtree_com[model.body_rootid]  # from the point that cdof is about
     turning, moving = pose.cdof[:, :3], pose.cdof[:, 3:]
     moment = below.T @ (mass[:, None] * arm)
@@ -94,7 +95,7 @@ def _slope(model: Any, here: Carried, field: jax.Array, step: jax.Array) -> tupl
 
 def _carried(model: Any, pose: Any, mass: jax.Array) -> Carried:
     joint = np.asarray(model.dof_jntid)
-    below = jnp.asarray(_moved(model), mass.dtype)
+    below = jnp.asarray(moved_bodies(model), mass.dtype)
     total = below.T @ mass
     first = below.T @ (mass[:, None] * pose.xipos)
     kind = np.asarray(model.jnt_type)[joint]
@@ -102,17 +103,9 @@ def _carried(model: Any, pose: Any, mass: jax.Array) -> Carried:
     return Carried(pose.xaxis[joint], turns, total, first - total[:, None] * pose.xanchor[joint])
 
 
-def _moved(model: Any) -> np.ndarray:
-    """[nbody, nv] True where a degree of freedom moves a body."""
-    above = np.eye(model.nbody, dtype=bool)
-    for body in range(1, model.nbody):
-        above[body] |= above[model.body_parentid[body]]
-    return above[:, model.dof_bodyid]
-
-
 def _above(model: Any) -> np.ndarray:
     """[nv, nv] True where the column's degree of freedom moves the row's joint, or is the same."""
-    moves = _moved(model)[model.dof_bodyid]
+    moves = moved_bodies(model)[model.dof_bodyid]
     same = np.equal.outer(model.dof_bodyid, model.dof_bodyid)  # of joints of one body the first carries the others
     order = np.arange(model.nv)
     return moves & (~same | (order[None, :] <= order[:, None]))

@@ -208,13 +208,18 @@ def _ancestors(model: Any) -> np.ndarray:
     return above
 
 
+def moved_bodies(model: Any) -> np.ndarray:
+    """[nbody, nv] True where a degree of freedom moves a body."""
+    return _ancestors(model)[:, model.dof_bodyid]
+
+
 def _subtree_mass(model: Any) -> jax.Array:
     return jnp.asarray(_ancestors(model).T, dtype=model.body_mass.dtype) @ model.body_mass
 
 
 def _body_invweight(model: Any, data: Any, inverse: jax.Array) -> jax.Array:
     """[nbody, 2] mean of diag(J M^-1 J^T) over translation and rotation, J at the body's centre of mass."""
-    moves = jnp.asarray(_ancestors(model)[:, model.dof_bodyid], dtype=inverse.dtype)  # [nbody, nv]
+    moves = jnp.asarray(moved_bodies(model), dtype=inverse.dtype)  # [nbody, nv]
     angular, linear = data.cdof[:, :3], data.cdof[:, 3:]
     arm = data.xipos - data.subtree_com[model.body_rootid]
     jac_linear = linear[None] + jnp.cross(angular[None], arm[:, None])  # [nbody, nv, 3]

@@ -182,7 +182,7 @@ class Scene:
         """The mjx.Model on the default device; ValueError for a model that MJX does not support."""
         import jax
 
-        from droid_jax.model.quiet_mjx import mjx
+        from droid_jax.quiet import mjx
 
         _ = self._sha256_of_mjx
         try:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.effect_interface import Effect, Rollout, complete
+from droid_jax.model.effect_interface import MOVING, Effect, Rollout, complete, has_law
 from droid_jax.model.parameters import Role, Space
 from droid_jax.model.physics import make_c_model, theta_of
 from droid_jax.model.scene import Scene
@@ -29,6 +29,7 @@ from droid_jax.simulate.inverse_dynamics import Path, PathTorques
 from droid_jax.simulate.replay import Drive, check_stateless
 from droid_jax.simulate.servo_gains import check_gains, scale_gains, servo_factors
 
+NOT_IN_C = tuple(law for law in (*MOVING, "observe") if law != "profile")  # laws that a servo replay in C lacks
 CHUNK = 64  # samples whose full states are in memory at once
 
 
@@ -116,8 +117,7 @@ def why_not_in_c(scene: Scene, space: Space, torque: TorqueConvention, effects: 
         torque: the torque convention of the recording.
         effects: in the replay, without those of the torque offsets.
     """
-    functions = ("command", "servo", "limits", "gear", "force", "frictionloss", "observe")
-    if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
+    if active := [e.name for e in effects if has_law(e, NOT_IN_C)]:
         return f"effects depend on the state: {', '.join(active)}"
     if sensed := space.of_role(Role.VISCOUS, Role.COULOMB, Role.TORQUE_GAIN):
         return f"C does not have {', '.join(p.name for p in sensed)}"
@@ -180,8 +180,7 @@ def c_path_torques(
 
 def why_no_path_in_c(space: Space, torque: TorqueConvention, effects: Sequence[Effect]) -> str:
     """Why plain C cannot replay a measured motion; empty if it can.  The arguments are those of `why_not_in_c`."""
-    functions = ("command", "servo", "limits", "gear", "profile", "force", "frictionloss")
-    if active := [e.name for e in effects if any(getattr(e, f) is not None for f in functions)]:
+    if active := [e.name for e in effects if has_law(e, MOVING)]:
         return f"effects depend on the state: {', '.join(active)}"
     if not torque.gravity and any(w.field == "qpos0" for p in space.parameters for w in p.writes):
         return "the robot subtracted gravity at the positions that encoders read, not at the true ones"

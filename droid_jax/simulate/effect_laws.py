@@ -40,12 +40,16 @@ class Moving(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """A time step: mjx.Data after it, what it carries on, the model that made it, and the gears (None: rigid)."""
+    """A time step: mjx.Data after it, what it carries on, and the model that made it.
+
+    push [nv] and reading [3, nv] are those of its gears (`GearStep`); None if all are rigid.
+    """
 
     data: Any
     moving: Moving
     model: Any
-    gears: GearStep | None
+    push: jax.Array | None = None
+    reading: jax.Array | None = None
 
 
 def step_with_effects(
@@ -83,15 +87,16 @@ def step_with_effects(
     before = template.replace(qpos=moving.qpos, qvel=moving.qvel, qacc_warmstart=moving.warm, ctrl=ctrl)
     push = apply_forces(theta, state, effects, error, gears)
     after = simulate_step(used, before, parity=parity, servo_damping=servo_damping, push=push)
-    motors, load, torques = moving.motors, after.qfrc_actuator, moving.gear
-    if gears is not None:
-        motors = gears.after((after.qvel - moving.qvel) / model.opt.timestep)
-        load = load + gears.reading(motors)[2]
+    torques = gear_torques(used, after, moving.qvel) if changes_friction(effects) else moving.gear
+    carried = Moving(after.qpos, after.qvel, after.qacc_warmstart, after.qfrc_actuator, torques, moving.motors)
+    if gears is None:
+        return Stepped(after, carried, used)
+    motors = gears.after((after.qvel - moving.qvel) / model.opt.timestep)
+    reading = gears.reading(motors)
     if changes_friction(effects):
-        torques = gear_torques(used, after, moving.qvel)
-        torques = torques if gears is None else torques + jnp.stack([gears.push, -gears.push])
-    carried = Moving(after.qpos, after.qvel, after.qacc_warmstart, load, torques, motors)
-    return Stepped(after, carried, used, gears)
+        torques = torques + jnp.stack([gears.push, -gears.push])
+    carried = carried._replace(load=carried.load + reading[2], gear=torques, motors=motors)
+    return Stepped(after, carried, used, gears.push, reading)
 
 
 def gear_of(effects: Sequence[Effect]) -> Gear | None:

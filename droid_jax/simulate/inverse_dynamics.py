@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from droid_jax.model.effect_interface import Effect, Rollout, State, Theta, column, complete
+from droid_jax.model.effect_interface import STEERING, Effect, Rollout, State, Theta, column, complete, has_law
 from droid_jax.model.encoders import encoder_error, misplaced_weight
 from droid_jax.model.gravity import field_force
 from droid_jax.model.parameters import Role
@@ -157,7 +157,7 @@ def path_replay(
             fluid.
     """
     refuse_fluid(scene.model, f"a replay of scene {scene.name!r}")
-    steering = [e.name for e in effects if e.profile or e.command or e.servo or e.limits or e.gear]
+    steering = [e.name for e in effects if has_law(e, STEERING)]
     if steering:
         raise ValueError(f"effects {', '.join(steering)} change commands, which a prescribed motion does not have")
     joints = joints or scene.joints

@@ -241,15 +241,14 @@ def servo_motion(
         state = moving.state(time if origin is None else origin + time, model)
         row = k + earlier if earlier else k
         command = _command(table, drive.timestep, row, shift, theta, effects)
-        after, following, used, gears = step_with_effects(
+        after, following, used, push, reading = step_with_effects(
             template, model, theta, state, moving, command, effects, error=error, parity=parity, servo_damping=damping
         )
         mean = 0.5 * (qvel + after.qvel)
         servo = servo_force(used, after, mean) if damping and not parity else after.qfrc_actuator
         torque = _joint_torque(used, qvel, after, servo, joints, drive, parity)
-        read = None if gears is None else gears.reading(following.motors)[:, joints]
-        if read is not None and gears is not None:
-            torque = torque + (read[2] if drive.torque.side is TorqueSide.MOTOR else gears.push[joints])
+        if push is not None and reading is not None:
+            torque = torque + (reading[2] if drive.torque.side is TorqueSide.MOTOR else push)[joints]
         astray = misplaced_compensation(model, after, error)
         if astray is not None and drive.torque.gravity:  # such a torque contains the gravity compensation
             torque = torque + astray[joints]
@@ -257,8 +256,8 @@ def servo_motion(
         velocity = (qvel + half * (after.qvel - qvel))[joints]
         now = (
             torque,
-            position if read is None else position + read[0],
-            velocity if read is None else velocity + read[1],
+            position if reading is None else position + reading[0, joints],
+            velocity if reading is None else velocity + reading[1, joints],
             qpos[hinge] + shift * drive.timestep * qvel[hinge_speed] if hinge is not None else jnp.zeros(()),
             _touching(after, fingers),
         )

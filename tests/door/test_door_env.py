@@ -49,8 +49,8 @@ def rolled(env: DoorEnv, script: np.ndarray) -> Callable[[State], dict[str, np.n
         action = jax.numpy.concatenate([(target[:7] - position) / TASK.reach, 2 * target[7:] / TASK.width - 1])
         state = env.step(state, action)
         world, metrics = state.pipeline_state, state.metrics
-        told = {name: metrics[name] for name in ("angle", "grip", "blown_up")}
-        return state, {**told, "qpos": world.moving.qpos, "obs": state.obs, "reward": state.reward, "done": state.done}
+        shown = {name: metrics[name] for name in ("angle", "grip", "blown_up")}
+        return state, {**shown, "qpos": world.moving.qpos, "obs": state.obs, "reward": state.reward, "done": state.done}
 
     def roll(start):
         return jax.lax.scan(act, start, np.asarray(script, np.float32))[1]

@@ -20,7 +20,7 @@ from droid_jax.model.mjx_internals import (
 
 
 def replaced(function: tuple[str, str]):
-    """The function of mjx as it is now."""
+    """The function that mjx calls."""
     return getattr(private(function[0]), function[1])
 
 

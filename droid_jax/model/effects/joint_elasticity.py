@@ -52,12 +52,12 @@ def joint_compliance(scene: Scene) -> Effect | None:
             velocity=rollout.velocity.at[:, columns].add(jnp.gradient(twist, axis=0) / step),
         )
 
-    usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
+    sizes = servos.compliances
 
     def parameter(joint: str, stiffness: float):
         # The lower bound is below zero so that a rigid joint is not at a bound; 1 + k c stays well above zero.
-        high, low = max(1e-3, 0.3 / stiffness), -min(usual[joint], 0.5 / stiffness)
-        return a.coefficient(f"{COMPLIANCE}[{joint}]", "rad/(N m)", usual[joint], high, low=low)
+        usual, high = sizes[joint]
+        return a.coefficient(f"{COMPLIANCE}[{joint}]", "rad/(N m)", usual, high, low=-min(usual, 0.5 / stiffness))
 
     return Effect(
         COMPLIANCE,
@@ -68,7 +68,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         signature="tracking error in proportion to load",
         confused_with=("servo_gain", "torque_gain"),
         locations=a.locations(servos.joints, COMPLIANCE),
-        minimum_size=0.2 * min(usual.values()),
+        minimum_size=0.2 * min(usual for usual, _ in sizes.values()),
     )
 
 

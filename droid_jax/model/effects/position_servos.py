@@ -33,6 +33,15 @@ class PositionServos:
     gear: np.ndarray
     stiffness: np.ndarray
 
+    @property
+    def compliances(self) -> dict[str, tuple[float, float]]:
+        """Joint -> prior deviation and upper bound of its gear's compliance, rad/(N m).
+
+        They are relative to the servo's own, since the data constrain both together.
+        """
+        each = zip(self.joints, self.stiffness.tolist(), strict=True)
+        return {joint: (max(1e-4, 0.05 / k), max(1e-3, 0.3 / k)) for joint, k in each}
+
     def where(self, chosen: np.ndarray) -> PositionServos | None:
         """Those of `chosen`, [J] bool; None if it chooses none."""
         if not chosen.any():

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from droid_jax.model.effect_interface import LAWS, Effect
+from droid_jax.model.effect_interface import LAWS, Effect, has_law
 from droid_jax.model.effects.effect_scaling import sized
 from droid_jax.model.fields import ENCODER
 from droid_jax.model.inertia import PSEUDO_INERTIA, WEIGHTS
@@ -150,7 +150,7 @@ def in_variant(scene: Scene, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     found = list[Effect]()
     for effect in effects:
         made = _MAKERS[effect.name](scene) if effect.name in _MAKERS else effect
-        if made is None and any(getattr(effect, law) is not None for law in LAWS):
+        if made is None and has_law(effect, LAWS):
             raise ValueError(
                 f"scene {scene.name!r} with the recording's numbers (variant) cannot have the effect {effect.name!r}: "
                 f"leave it out (--without {effect.name})"

@@ -20,17 +20,16 @@ it, so arms with compensated bodies do not have these effects.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from droid_jax.model.effect_interface import Effect, Gear, GearStep, State, Theta, column
 from droid_jax.model.effects import coefficients as a
 from droid_jax.model.effects.position_servos import PositionServos, arm_servos
 from droid_jax.model.effects.registry import register
+from droid_jax.model.physics import moved_bodies
 from droid_jax.model.scene import Scene
 
 RESONANCE, BACKLASH, DAMPING = "two_mass_resonance", "two_mass_backlash", "two_mass_damping"
@@ -45,11 +44,8 @@ def two_mass_resonance(scene: Scene) -> Effect | None:
     servos = _geared(scene)
     if servos is None:
         return None
-    usual = {j: max(1e-4, 0.05 / float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)}
-    of_joints = (
-        a.coefficient(f"{RESONANCE}[{j}]", "rad/(N m)", usual[j], max(1e-3, 0.3 / float(k)), low=0.0)
-        for j, k in zip(servos.joints, servos.stiffness, strict=True)
-    )
+    sizes = servos.compliances
+    of_joints = (a.coefficient(f"{RESONANCE}[{j}]", "rad/(N m)", *sizes[j], low=0.0) for j in servos.joints)
     return Effect(
         RESONANCE,
         (*of_joints, a.shape(DAMPING, "-", DAMPING_RATIOS, 0.0, 1.0)),
@@ -60,7 +56,7 @@ def two_mass_resonance(scene: Scene) -> Effect | None:
         special_cases=("joint_compliance",),
         locations=a.locations(servos.joints, RESONANCE),
         shape_parameters={DAMPING: DAMPING_RATIOS},
-        minimum_size=0.2 * min(usual.values()),
+        minimum_size=0.2 * min(usual for usual, _ in sizes.values()),
     )
 
 
@@ -91,16 +87,8 @@ def _geared(scene: Scene) -> PositionServos | None:
     servos, model = arm_servos(scene), scene.model
     if servos is None:
         return None
-    joints = set(model.dof_jntid[servos.dofs].tolist())
-    carried = (joints.intersection(_joints_above(model, int(body))) for body in np.flatnonzero(model.body_gravcomp))
-    return None if any(carried) else servos.where(model.dof_armature[servos.dofs] > 0.0)
-
-
-def _joints_above(model: mujoco.MjModel, body: int) -> Iterator[int]:
-    """Joints that move a body."""
-    while body:
-        yield from range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
-        body = int(model.body_parentid[body])
+    carried = moved_bodies(model)[np.ix_(model.body_gravcomp != 0.0, servos.dofs)]
+    return None if carried.any() else servos.where(model.dof_armature[servos.dofs] > 0.0)
 
 
 @functools.lru_cache(maxsize=64)
@@ -115,12 +103,10 @@ def _gear(scene: Scene) -> Gear:
     def start(theta: Theta, state: State, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         compliance, half, _ = _of(servos, theta)
         # qpos is what was recorded: the link's position and the twist of the gear.
-        stiffness, torque = (
-            servos.stiffness_in(state),
-            jnp.clip(servos.rigid_torque(state, ctrl), *servos.limits_in(state)),
-        )
+        stiffness, torque = servos.stiffness_in(state), servos.rigid_torque(state, ctrl)
         free = torque / stiffness  # the lead at which the servo is at its goal
-        elastic = compliance * (torque - stiffness * jnp.sign(torque) * half)
+        held = jnp.clip(torque - stiffness * jnp.sign(torque) * half, *servos.limits_in(state))
+        elastic = compliance * held
         inside = jnp.abs(free) < half
         elastic = jnp.where(inside, 0.0, elastic)
         lead = jnp.where(inside, free, jnp.sign(torque) * half + elastic)

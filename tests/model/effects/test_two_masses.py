@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from droid_jax.model.effect_interface import State
 from droid_jax.model.effects.registry import library
 from droid_jax.model.effects.two_masses import BACKLASH, DAMPING, RESONANCE
 from droid_jax.model.fields import time_offset
@@ -165,6 +166,17 @@ def test_neutral_is_the_rigid_gear_and_both_act():
     neutral, elastic, loose = positions(scene, space, np.stack([*rows, rows[0]]), command)[:3]
     np.testing.assert_allclose(neutral, np.asarray(bare.position)[0, :, 0], atol=2e-6)
     assert np.abs(elastic - neutral).max() > 1e-3 < np.abs(loose - neutral).max()
+
+
+def test_a_motion_that_begins_at_the_servos_limit_begins_with_its_twist():
+    """The gear carries the limit and not what the servo is asked for."""
+    scene = rigid(0.0, limit=1.0)
+    (effect,) = library(scene, [RESONANCE])
+    assert effect.gear is not None
+    still = jnp.zeros(1)
+    state = State(jnp.float32(0.0), still, still, still, scene.mjx, motors=jnp.zeros((3, 1)))
+    motors, ahead = effect.gear.start({f"{RESONANCE}[j]": jnp.float32(2e-3)}, state, jnp.array([0.5]))
+    np.testing.assert_allclose([motors[0, 0], ahead[0]], 2e-3 * 1.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize("values", [{f"{RESONANCE}[j]": 5e-3}, {f"{BACKLASH}[j]": 0.02}])
