@@ -22,6 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 import tuned  # noqa: E402, F401  (before jax starts)
 
 # isort: split
+import itertools  # noqa: E402
 import json  # noqa: E402
 import math  # noqa: E402
 import time  # noqa: E402
@@ -71,6 +72,8 @@ HELD = 1.5  # s, before that: the robot settles where its servos hold it, and no
 NOISE = 1e-4  # rad, of a position sample
 SO101_NOISE = 4.4e-4  # rad, the deviation of rounding to its encoder's 4096 counts
 STEP_EVERY, STEP_SIZE = 1.7, 0.3  # s and rad, of a servo's goal
+ANGLES = (0.9, 0.3, 1.2, 0.6, -0.4, -1.0, -0.2, 0.8, 1.4, 0.5, -0.7, 0.1)  # rad, of a servo's goal that rests
+MOVE = 0.8  # s from one to the next
 FACTORS = (3.0, 10.0)  # of the minimum effect size
 STROKES = ((3.0, 0.9), (5.0, 0.9), (4.6, 0.8), (3.4, 0.95), (2.6, 0.75), (5.4, 0.85))  # s and rad, there and back
 ARM = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
@@ -192,7 +195,8 @@ def bench(scene: str, channels: str, so101: Path | None = None) -> Bench:
         friction = f'frictionloss="{SERVO_FRICTION}"' if scene == SOFT else ""
         spec, joints = mujoco.MjSpec.from_string(SERVO.format(friction=friction)), ("j",)
         model = ready(compile_scene(spec, "servo", joints=joints))
-        base, command = _servo_base(model), _waves(np.maximum(clock - HELD, 0.0), joints) + _steps(clock - HELD)
+        moved = _waves(np.maximum(clock - HELD, 0.0), joints) + _steps(clock - HELD)
+        base, command = _servo_base(model), _rests(clock - HELD) if scene == SOFT else moved
     else:
         assert so101 is not None  # its cases are planned only then
         file = ROOT / "experiments" / "so101.json"
@@ -236,6 +240,15 @@ def _steps(clock: np.ndarray) -> np.ndarray:
     """[T, 1] rad, jumps of a servo's goal in the second half of a log."""
     count = np.floor((clock - 0.5 * SECONDS) / STEP_EVERY)
     return np.where(count >= 0, STEP_SIZE * (count % 2), 0.0)[:, None]
+
+
+def _rests(clock: np.ndarray) -> np.ndarray:
+    """[T, 1] rad, moves of MOVE s between ANGLES and rests, in which a joint with soft friction creeps."""
+    angles, goal = np.array([0.0, *ANGLES]), np.zeros(len(clock))
+    for number, (before, after) in enumerate(itertools.pairwise(angles)):
+        share = minimum_jerk((clock - number * SECONDS / len(ANGLES)) / MOVE)
+        goal += (after - before) * share
+    return goal[:, None]
 
 
 def _waves(clock: np.ndarray, joints: Sequence[str]) -> np.ndarray:

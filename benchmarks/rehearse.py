@@ -40,8 +40,8 @@ from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
+from droid_jax.rehearsal.config import RehearsalConfig  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
-from droid_jax.rehearsal.linear import RehearsalConfig  # noqa: E402
 from droid_jax.rehearsal.linearised import rehearsed  # noqa: E402
 from droid_jax.rehearsal.plan import RehearsalPlan  # noqa: E402
 from droid_jax.rehearsal.quick import quick_rehearsal  # noqa: E402

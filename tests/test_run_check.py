@@ -13,7 +13,9 @@ from two_link import ARM, JOINTS, MOTOR, arm, measured, motion, recording
 
 from benchmarks.check_cases import RATE, played
 from benchmarks.check_cases import measured as recorded_channels
-from droid_jax.identify.additions import Addition, MotionProposal, additions, propose
+from droid_jax.cost.cost import make_cost
+from droid_jax.cost.residuals import CompareConfig
+from droid_jax.identify.additions import Addition, MotionProposal, additions, motion_recording, propose
 from droid_jax.identify.excitation import Excitation, ExcitationConfig, identifiability_of
 from droid_jax.identify.holdout import beginning
 from droid_jax.model.fields import joint_damping
@@ -243,6 +245,53 @@ def test_a_slide_goes_as_far_as_its_own_motion_beside_a_sample_that_is_missing()
     position = Channel("position", "m", ("x",), time, values, mask)
     log = Recording("slide", np.zeros(0), np.zeros((0, 0)), (), {"position": position}, MOTOR)
     assert max(np.abs(a.path).max() for a in additions(scene, log)) < 0.1
+
+
+GANTRY = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="0 0.4"
+  limited="true"/><geom size=".1" mass="1"/><body><joint name="tool" axis="0 0 1" damping="1"/><geom size=".05"
+  pos=".1 0 0" mass=".1"/></body></body></worldbody><actuator><position name="x" joint="x" kp="500" gear="50"/>
+  <motor name="tool" joint="tool"/></actuator></mujoco>"""
+
+
+def gantry_log() -> Recording:
+    """A geared slide that moves from 0.1 to 0.2 m, and a motor whose command is a torque."""
+    time = np.arange(0.0, 5.0, 0.01)
+    moved = 0.15 - 0.05 * np.cos(time)
+    command = np.column_stack([50 * moved, np.full(len(time), 20.0)])
+    values = np.column_stack([moved, 0.01 * time])[None]
+    position = Channel("position", "rad or m", ("x", "tool"), time, values, np.ones(values.shape, bool))
+    return Recording(
+        "gantry", time, command, ("x", "tool"), {"position": position}, MOTOR, qpos0={"x": 0.1, "tool": 0.0}
+    )
+
+
+def test_proposed_motions_of_a_geared_slide_are_in_its_own_unit():
+    """Regressions: they were longer by the gear, and a motor's command became the position that a replay begins at."""
+    scene = compile_scene(mujoco.MjSpec.from_string(GANTRY), "gantry", joints=["x", "tool"])
+    log = gantry_log()
+    tried = additions(scene, log)
+    assert {a.joint for a in tried} == {"x"} and max(np.ptp(a.path) for a in tried) < 50 * 0.25
+    made = motion_recording(scene, log, tried[0], "made")
+    assert made.qpos0 == pytest.approx({"x": 0.1, "tool": 0.0})
+    space = Space((joint_damping(scene, "x", std=1.0, high=9.0), joint_damping(scene, "tool", std=0.5, high=9.0)))
+    positions = CompareConfig(channels={"position": 1.0})
+    cost = make_cost(scene, space, made, config=positions, check=False)  # its placeholders are inside the ranges
+    assert np.isfinite(cost(space.mean[None])).all()
+
+
+def test_a_beginning_ends_when_the_last_joint_has_moved():
+    """Regression: it ended at the command's step, so that the joint's position was constant, which is refused."""
+    time = np.arange(0.0, 60.0, 0.01)
+    command = np.column_stack([0.3 * np.sin(time), np.where(time < 30.0, 0.0, 0.5)])
+    values = np.where(np.arange(2) == 0, command, np.roll(command, 5, axis=0))[None]
+    late = time[time >= 35.0]
+    channels = {
+        "position": Channel("position", "rad", JOINTS, time, values, np.ones(values.shape, bool)),
+        "torque": Channel("torque", "N m", JOINTS, late, np.ones((1, len(late), 2)), np.ones((1, len(late), 2), bool)),
+    }
+    log = recording(time=time, command=command, channels={"position": channels["position"]})
+    assert np.ptp(beginning(log, 20.0).channels["position"].values[0, :, 1]) == pytest.approx(0.5)
+    assert beginning(replace(log, channels=channels), 20.0).span[1] == pytest.approx(36.0)
 
 
 def test_bad_calls(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from droid_jax.commands.folder import PATHS
 from droid_jax.files import CONFIG, EXTENDED, FIT, FULL_GAUSSIAN, GAP
 from droid_jax.read_json import read_json
-from droid_jax.report.stages import needs_whole, setup
+from droid_jax.report.stages import left_over, needs_whole, setup
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,8 +49,9 @@ def fitted_folder(given: Path) -> tuple[str, Path]:
 
     Raises ValueError if there is none.
     """
+    old = left_over(given)
     for stage, name in (("gap", GAP), ("identify", CONFIG)):
-        for folder in (given, given / stage):
+        for folder in (given, *(() if stage in old else (given / stage,))):
             if (folder / name).is_file() and (stage == "gap" or (folder / FIT).is_file()):
                 needs_whole(folder)
                 return stage, folder
@@ -85,7 +86,11 @@ def _identified(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitt
     known = {p.name: p for p in fit.parameters}
     if absent := [name for name in space.names if name not in known]:
         raise ValueError(f"{folder / FIT} lacks {', '.join(absent)} of {FULL_GAUSSIAN}: they are of two runs")
-    scene, effects = effects_in(command, _scene_of(asked, given, _rubbed(space.parameters)))
+    rubbed = _rubbed(space.parameters)
+    scene = _scene_of(asked, given, rubbed)
+    if scene.sha256 != asked.get("scene_sha256") and (every := _rubbed_in_file(asked)) != rubbed:
+        scene = _scene_of(asked, given, every)  # the scene was compiled for nuisances too, which were not fitted
+    scene, effects = effects_in(command, scene)
     _check_same(folder, asked, scene, given)
     return Fitted(
         stage="identify",
@@ -175,6 +180,14 @@ def _rubbed(parameters: Iterable[Parameter]) -> tuple[str, ...]:
     """Joints whose friction loss is a parameter; the scene was compiled with a constraint for each."""
     writes = (w for p in parameters for w in p.writes)
     return tuple(dict.fromkeys(w.element for w in writes if w.field == "dof_frictionloss" and w.element))
+
+
+def _rubbed_in_file(asked: dict[str, Any]) -> tuple[str, ...]:
+    """Those of the parameter file, nuisances included; none if it is no longer there."""
+    from droid_jax.model.parameter_file import friction_joints
+
+    file = asked.get("parameters")
+    return friction_joints(Path(file)) if file and Path(file).is_file() else ()
 
 
 def _command(kind: type[Options], asked: dict[str, Any]) -> Options:

@@ -144,7 +144,7 @@ def run(command: Identify) -> None:
     scene, space, nuisances = identify_model(command)
     scene, space, effects = with_effects(command, scene, space)
     given, judges = _given(command)
-    needs_log(command.motion_cutoff, given)
+    needs_log(command.motion_cutoff, (*given, *judges))
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if finished(out, setup, command.again):

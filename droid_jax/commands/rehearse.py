@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
     from droid_jax.model.scene import Scene
     from droid_jax.recordings.recording import Recording
-    from droid_jax.rehearsal.linear import RehearsalConfig
+    from droid_jax.rehearsal.config import RehearsalConfig
     from droid_jax.rehearsal.linearised import Rehearsed
     from droid_jax.rehearsal.plan import RehearsalPlan
 
@@ -102,7 +102,7 @@ def run(command: Rehearse) -> None:
     runtime.start()
     if command.full:
         warn_of_cpu(command.preset)
-    from droid_jax.rehearsal.linear import RehearsalConfig
+    from droid_jax.rehearsal.config import RehearsalConfig
     from droid_jax.rehearsal.quick import quick_rehearsal
 
     refuse_special(command.out, "a folder")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,19 @@ from droid_jax.simulate.measured_motion import Motion, measured_motion
 from droid_jax.simulate.repeat_starts import from_one_start, own_starts
 from droid_jax.simulate.replay import Drive, make_drive
 from droid_jax.simulate.servo_gains import check_gains, servo_factors
+
+
+class OneReplay(NamedTuple):
+    """What one replay of a recording gives for P values; arrays of the host.
+
+    distance: [P] its cost.  penalty: [P] the part of it for a lost grasp or a door that stayed shut.
+    smoothed: [P, K, C] its leading channel through the filter of the data.  rollout: [P, T, ...].
+    """
+
+    distance: Any
+    penalty: Any
+    smoothed: Any
+    rollout: Rollout
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,6 +112,16 @@ class Cost:
         """
         identity = tuple((lambda r: r) for _ in self._replays)
         return self._blockwise(values, identity, tuple)
+
+    def replayed(self, values: Any) -> tuple[OneReplay, ...]:
+        """Return a `OneReplay` of host arrays for each recording, at values [P, D]: all from one replay."""
+
+        def of(number: int) -> Callable[[Rollout], OneReplay]:
+            distance, beta, smoothed = self._distances[number], self._beta[number], self._smoothed[number]
+            cost = self.comparisons[number].config.failure_cost
+            return lambda r: OneReplay(distance(r), cost * beta(r), smoothed(r), r)
+
+        return self._blockwise(values, [of(number) for number in range(len(self._replays))], tuple)
 
     def whitened_of(self, rollouts: Sequence[Rollout]) -> np.ndarray:
         """Return residuals [P, M] in noise units of given replays, one Rollout [P, T, ...] for each recording."""

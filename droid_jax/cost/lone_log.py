@@ -30,8 +30,7 @@ class LoneLog(Cost):
     def whitened(self, values: Any) -> np.ndarray:
         """Return residuals [P, M] at values [P, D], in units of the stated noise; zero at instants without weight."""
         noise = self._torque.noise
-        weight = np.einsum("ckk->kc", noise.whitener)
-        residual = (self.simulated(values) - noise.mean) * weight
+        residual = (self.simulated(values) - noise.mean) * noise.weight
         return np.swapaxes(residual, 1, 2).reshape(len(residual), -1)
 
     def simulated(self, values: Any) -> np.ndarray:
@@ -43,7 +42,7 @@ class LoneLog(Cost):
         (rollout,) = self.rollouts(values)
         comparison = self.comparisons[0]
         torque = self._torque
-        has_weight = np.any(np.einsum("ckk->kc", torque.noise.whitener) > 0, axis=1)
+        has_weight = np.any(torque.noise.weight > 0, axis=1)
         times = comparison.clock[0] + torque.at * (comparison.clock[1] - comparison.clock[0])
         instants = (times - self.clock[0]) / (self.clock[1] - self.clock[0])  # the clock is regular
         nearest = np.clip(np.ceil(instants - 0.5 - 1e-9).astype(int), 0, len(self.clock) - 1)
@@ -88,7 +87,7 @@ class LoneLog(Cost):
         deviation: [C] standard deviation in the channel's unit.  instants: [K] bool, those that have a weight.
         """
         noise = self._torque.noise.stated(np.maximum(deviation, self.least_noise()))
-        return self._with(replace(noise, whitener=noise.whitener * instants[:, None]))
+        return self._with(replace(noise, whitener=noise.whitener * instants))
 
     def with_torques(self, torque: np.ndarray) -> LoneLog:
         """Return the log with other measured torques [K, C] of the same motion."""

@@ -144,8 +144,8 @@ class Noise:
     """Noise of the mean of the repeats, for each column, over the coarse clock.
 
     mean: [K, C] of the smoothed repeats.  whitener: [C, K, K]; whitener @ (x - mean) has unit covariance if x is the
-    noise-free signal.  repeats: [N, K, C], smoothed.  count: [K, C] number of repeats that measured an instant; 0 in a
-    gap of the only repeat.
+    noise-free signal.  Of white noise [C, K], its diagonal.  repeats: [N, K, C], smoothed.  count: [K, C] number of
+    repeats that measured an instant; 0 in a gap of the only repeat.
     """
 
     mean: np.ndarray
@@ -158,8 +158,18 @@ class Noise:
 
         Instants that no repeat measured get weight zero.
         """
-        measured = (self.count > 0).T[:, None]  # [C, 1, K]
-        return replace(self, whitener=np.eye(len(self.mean)) * measured / deviation[:, None, None])
+        return replace(self, whitener=(self.count > 0).T / deviation[:, None])
+
+    @property
+    def weight(self) -> np.ndarray:
+        """[K, C] diagonal of the whitener: of white noise the weight of each instant."""
+        return self.whitener.T if self.whitener.ndim == 2 else np.einsum("ckk->kc", self.whitener)
+
+    def whitened(self, deviations: np.ndarray) -> np.ndarray:
+        """Return deviations [N, K, C] from the mean in units of the noise, [N, C, K]."""
+        if self.whitener.ndim == 2:
+            return self.whitener * np.swapaxes(deviations, 1, 2)
+        return np.einsum("ckl,nlc->nck", self.whitener, deviations)
 
 
 def estimate_noise(
@@ -184,15 +194,22 @@ def estimate_noise(
     _, length, columns = repeats.shape
     mean = repeats.mean(axis=0)
     count = np.full(mean.shape, len(repeats)) if measured is None else measured.sum(axis=0)
-    whitener = np.empty((columns, length, length))
+    models = list[tuple[np.ndarray, float, float]]()
     for c in range(columns):
         mask = np.ones(repeats.shape[:2], bool) if measured is None else measured[:, :, c]
         lags, constant = _lags(repeats[:, :, c] - mean[:, c], mask, config)
         variance = max(lags[0], minimum**2)
         lags = (1 - config.shrinkage) * lags
         lags[0] = variance
-        if not (constant or lags[1:].any()):  # white
-            whitener[c] = np.diag(np.sqrt(count[:, c] / variance))
+        models.append((lags, constant, variance))
+    white = [not (constant or lags[1:].any()) for lags, constant, _ in models]
+    if all(white):
+        variances = np.array([variance for _, _, variance in models])
+        return Noise(mean, np.sqrt(count.T / variances[:, None]), repeats, count)
+    whitener = np.zeros((columns, length, length))
+    for c, (lags, constant, variance) in enumerate(models):
+        if white[c]:
+            np.fill_diagonal(whitener[c], np.sqrt(count[:, c] / variance))
             continue
         covariance = (scipy.linalg.toeplitz(lags) + constant) / np.sqrt(np.outer(count[:, c], count[:, c]))
         whitener[c] = np.linalg.inv(np.linalg.cholesky(covariance))

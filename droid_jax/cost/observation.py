@@ -130,7 +130,8 @@ def prepared(
         )
     time, values, mask = channel.time[inside], channel.values[:, inside], channel.mask[:, inside]
     coarse = coarse_clock(float(time[0]), float(time[-1]), config.rate)
-    _check_memory(channel, coarse)
+    if len(values) > 1:  # the noise of one repeat is white
+        _check_memory(channel, coarse)
     kernel = lowpass(time, coarse, config)
     resampling = _resampling(clock, time)
     offsets = 0.0 if motion_torques is None else np.stack([resampling @ t[:, columns] for t in motion_torques])

@@ -163,7 +163,7 @@ class Comparison:
         parts = []
         for c in self.channels:
             deviations = c.noise.repeats - c.noise.mean  # [N, K, C]
-            parts.append(np.einsum("ckl,nlc->nck", c.noise.whitener, deviations).reshape(len(deviations), -1))
+            parts.append(c.noise.whitened(deviations).reshape(len(deviations), -1))
         return np.concatenate(parts, axis=1)
 
     def unexplained(self, rollout: Rollout) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -223,9 +223,8 @@ def _smooth(channel: Measured, trace: jax.Array) -> jax.Array:
 
 def _whiten(noise: Noise, x: jax.Array) -> jax.Array:
     """[C, K] deviations [K, C] in units of the noise."""
-    diagonal = np.einsum("ckk->ck", noise.whitener)
-    if np.count_nonzero(noise.whitener) == np.count_nonzero(diagonal):  # white noise: cheap also for a long log
-        return jnp.asarray(diagonal, jnp.float32) * x.T
+    if noise.whitener.ndim == 2:  # white noise
+        return jnp.asarray(noise.whitener, jnp.float32) * x.T
     return jnp.einsum("ckl,lc->ck", jnp.asarray(noise.whitener, jnp.float32), x)
 
 

@@ -23,7 +23,7 @@ from droid_jax.model.effect_interface import MOVING, STEERING, Effect, Rollout, 
 from droid_jax.model.effects.candidate import Candidate, EffectKey, Keys, keys_of
 from droid_jax.model.effects.effect_scaling import scale_of, usual_torques
 from droid_jax.model.effects.registry import library
-from droid_jax.model.parameters import Space
+from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene
 from droid_jax.recordings.recording import Recording
 
@@ -167,15 +167,19 @@ def sensitivities(
         for name, value in direction.candidate.shape_parameters.items():
             row[space.index(name)] = value
         p = space[direction.coefficient]
-        span = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
-        step = math.copysign(min(share * p.std, 0.5 * abs(span)), span)
-        size = step if at is None else at[number]
+        size = from_neutral(p, share) if at is None else at[number]
         row[space.index(direction.coefficient)] = p.mean + size
         rows.append(row)
         sizes.append(size)
     simulated = -residual_set.common(np.stack(rows))
     slopes = (simulated[1:] - simulated[0]) / np.array(sizes)[:, None]
     return np.where(np.isfinite(slopes).all(axis=1, keepdims=True), slopes, np.nan)
+
+
+def from_neutral(p: Parameter, share: float) -> float:
+    """Distance of a coefficient from neutral at which it is tried: a share of its deviation, at most half its range."""
+    span = p.high - p.mean or p.low - p.mean  # downwards where neutral is the upper bound
+    return math.copysign(min(share * p.std, 0.5 * abs(span)), span)
 
 
 def project(columns: np.ndarray, base: np.ndarray, prior: np.ndarray) -> np.ndarray:

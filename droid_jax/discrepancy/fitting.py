@@ -7,13 +7,14 @@ measured after a refit of all parameters.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from droid_jax.cost.windowed_log import WindowedLog
-from droid_jax.discrepancy.candidates import project
+from droid_jax.discrepancy.candidates import from_neutral, project
 from droid_jax.discrepancy.case import Case, ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
@@ -110,8 +111,10 @@ def one_step_fits(
 ) -> list[tuple[np.ndarray, float]]:
     """Models with one more effect each, after one Levenberg-Marquardt step with known slopes, all in the same batches.
 
-    Each effect has two starts: its proposed coefficients, and neutral.  A step moves a parameter by at most two prior
-    deviations, and the coefficient of a strong effect may be larger.  The better end of the two is returned.
+    Each effect has three starts: its proposed coefficients, neutral, and where its sensitivity was taken.  A step moves
+    a parameter by at most two prior deviations, and the coefficient of a strong effect may be larger.  An effect that
+    begins at a threshold, such as a limit of torque, has no slope at neutral and perhaps none at the proposal.  The
+    best end is returned.
 
     Args:
         residual_set: of the fitted recording.
@@ -133,7 +136,11 @@ def one_step_fits(
             jacobian[:, space.index(name)] = sensitivities[name] * space[name].std * np.sqrt(residual_set.repeats)
         without, coefficients = proposed.copy(), [whole.index(name) for name in part.coefficients]
         without[coefficients] = model.values[coefficients]
-        starts = np.stack([without, proposed])[:, whole.columns(space)]
+        tried = without.copy()
+        for name, at in zip(part.coefficients, coefficients, strict=True):
+            step = from_neutral(whole[name], residual_set.config.sensitivity_step)
+            tried[at] = whole[name].mean + math.copysign(step, proposed[at] - whole[name].mean or step)
+        starts = np.clip(np.stack([without, proposed, tried]), whole.low, whole.high)[:, whole.columns(space)]
         looks.append(Look(space, starts, jacobian, functools.partial(whole.embed, space, values=without)))
     ends = chords(residual_set.whitened, looks, config)
     return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ends, strict=True)]

@@ -24,16 +24,19 @@ from droid_jax.identify.excitation import (
 )
 from droid_jax.identify.identifiability import Identifiability
 from droid_jax.model.actuators import has_feedback
+from droid_jax.model.effect_interface import Rollout
 from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene
 from droid_jax.model.variant import variant_scene
 from droid_jax.preflight.preflight import torque_range
+from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.simulate.hand_path import minimum_jerk
 from droid_jax.simulate.servo_gains import scene_stiffness, with_stated_gains
 
 CHANNELS = ("torque", "position", "velocity")  # that the recording of an addition has
 DEFAULT_PROPOSAL = ProposalConfig()
+PLACEHOLDER = 1e-3  # rad, m or N m, rise of a channel that is not measured yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +231,12 @@ def _information(
     config = found.config
     with silent():
         cost = make_cost(scene, space, motions, engine=found.engine, config=config.compare, check=False)
+        if not recording.command.size and "torque" in recording.channels:  # friction at rest follows measured torques
+            motions = [
+                _with_torques(scene, motion, rollout)
+                for motion, rollout in zip(motions, cost.rollouts(found.values[None]), strict=True)
+            ]
+            cost = cost.against(motions)
     comparison = cost.comparisons[0]  # all have one clock and one filter, and the measurement cancels in differences
     channels = []
     for channel in comparison.channels:
@@ -246,30 +255,45 @@ def _information(
     return out
 
 
+def _with_torques(scene: Scene, motion: Recording, rollout: Rollout) -> Recording:
+    """A recording whose torques are those of its replay [1, T, ...]."""
+    channel = motion.channels["torque"]
+    torque = interpolate(channel.time, np.asarray(rollout.time[0]), np.asarray(rollout.torque[0]))
+    values = torque[None, :, [scene.joints.index(j) for j in channel.columns]]
+    return replace(motion, channels={**motion.channels, "torque": replace(channel, values=values)})
+
+
 def motion_recording(scene: Scene, recording: Recording, addition: Addition, name: str) -> Recording:
     """Return an addition as a recording of one repeat, with placeholder measurements: only its replay is used."""
     scene = variant_scene(scene, recording.variant, recording.name)
     joints, start = _start(scene, recording)
     table = np.tile(start, (len(addition.time), 1))
     table[:, joints.index(addition.joint)] = addition.path
-    shape = (1, len(addition.time), len(joints))
-    # Placeholders increase with time, since constant channels are refused.
-    placeholder = np.tile(np.linspace(0.0, 1.0, shape[1])[None, :, None], (1, 1, shape[2]))
+    commanded = bool(recording.command.size)
+    # Of a motor the command is no position.
+    places = {
+        j: float(q) / _gear(scene, recording, j)
+        for j, q in zip(joints, start, strict=True)
+        if j in scene.single_joints and not (commanded and j not in _servos(scene))
+    }
+    begin = {**recording.measured_start(), **recording.qpos0, **places}
+    # Placeholders increase with time, since constant channels are refused, and stay near the start.
+    rising = np.linspace(0.0, PLACEHOLDER, len(addition.time))
     channels = dict[str, Channel]()
     for key in CHANNELS:
         if key not in recording.channels and key != "position":
             continue
         names = recording.channels[key].columns if key in recording.channels else joints
-        columns = [j for j in names if j in joints]
-        values = table[None] if key == "position" and not recording.command.size else placeholder
-        values = values[..., [joints.index(j) for j in columns]].copy()
+        columns = tuple(j for j in names if j in joints)
+        if key == "position" and not commanded:
+            values = table[:, [joints.index(j) for j in columns]]
+        else:
+            first = [begin.get(j, 0.0) if key == "position" else 0.0 for j in columns]
+            values = np.array(first) + rising[:, None]
         unit = recording.channels[key].unit if key in recording.channels else "rad"
-        channels[key] = Channel(key, unit, tuple(columns), addition.time, values, np.ones(values.shape, bool))
-    begin = {
-        j: float(q) / _gear(scene, recording, j) for j, q in zip(joints, start, strict=True) if j in scene.single_joints
-    }
-    qpos0 = {**recording.qpos0, **begin}
-    commanded = bool(recording.command.size)
+        measured = np.ones((1, *values.shape), bool)
+        channels[key] = Channel(key, unit, columns, addition.time, values[None].copy(), measured)
+    qpos0 = {j: q for j, q in begin.items() if j in recording.qpos0 or j in scene.single_joints}
     return Recording(
         name=name,
         time=addition.time if commanded else np.zeros(0),
@@ -330,7 +354,7 @@ def _free_range(
             if recording.command.size
             else _measured(recording.channels["position"], joint)
         )
-        unit = float(np.ptp(path))
+        unit = float(np.ptp(path)) / abs(_gear(scene, recording, joint))
     return max(0.0, config.range_share * (q - low)), max(0.0, config.range_share * (high - q)), unit
 
 

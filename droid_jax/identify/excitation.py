@@ -39,6 +39,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_no_path_in_c, why_not_in_c
+from droid_jax.simulate.replay import replayed_torque
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ def engine_for(scene: Scene, space: Space, recordings: Sequence[Recording]) -> s
     """Return "mujoco" if plain C can replay the recordings, since it needs no compilation; else "mjx"."""
     for recording in recordings:
         own = variant_scene(scene, recording.variant, recording.name)
-        if recording.command.size and (scene.has_contacts or why_not_in_c(own, space, recording.torque, ())):
+        if recording.command.size and (scene.has_contacts or why_not_in_c(own, space, replayed_torque(recording), ())):
             return "mjx"
         if not recording.command.size and why_no_path_in_c(space, recording.torque, ()):
             return "mjx"
@@ -305,8 +306,7 @@ def _noise_of(scene: Scene, comparisons: Sequence[Comparison]) -> dict[str, dict
     out: dict[str, dict[str, float]] = {}
     for channel in (c for comparison in comparisons for c in comparison.channels):
         of_channel = out.setdefault(channel.name, {})
-        for whitener, column in zip(channel.noise.whitener, channel.columns.tolist(), strict=True):
-            diagonal = np.abs(np.diagonal(whitener))
+        for diagonal, column in zip(np.abs(channel.noise.weight.T), channel.columns.tolist(), strict=True):
             weighted = diagonal[diagonal > 0]
             deviation = float(np.exp(-np.mean(np.log(weighted)))) if weighted.size else np.inf
             joint = scene.joints[column] if column < len(scene.joints) else str(scene.object_joint)

@@ -29,11 +29,13 @@ class BeginningConfig:
     long: factor on the requested seconds above which a recording is long; a design choice.
     covered: share of its range that every command must have covered at the end of the beginning; a design choice.
     still: share of its range by which a command may have changed while the robot still stands; a design choice.
+    responds: s after which the last joint to be commanded has moved, and the last channel has samples; a design choice.
     """
 
     long: float = 1.5
     covered: float = 0.5
     still: float = 0.01
+    responds: float = 1.0
 
     def __post_init__(self) -> None:
         check_fields(
@@ -41,6 +43,7 @@ class BeginningConfig:
             long=partial(number, least=1),
             covered=partial(number, least=0, most=1),
             still=partial(number, least=0, most=1),
+            responds=partial(number, least=0),
         )
 
 
@@ -125,18 +128,17 @@ def heldout_distances(
         worth: share of the noise floor by which the distance before the fit must exceed it for `closed` to be defined.
         whole_recordings: the held-out data are whole recordings that the fit did not use.
     """
-    penalty_free = cost.distances(np.stack([before, after])) - cost.penalties(np.stack([before, after]))
-    smoothed, rollouts = cost.smoothed(np.stack([before, after])), cost.rollouts(np.stack([before, after]))
+    replayed = cost.replayed(np.stack([before, after]))
     out: list[HeldoutDistance] = []
     for i, (one, recording, heldout) in enumerate(zip(cost.comparisons, recordings, held, strict=True)):
         measured = one.leading.noise.count > 0
-        residual = np.where(measured, smoothed[i] - one.leading.noise.mean, 0.0)
+        residual = np.where(measured, replayed[i].smoothed - one.leading.noise.mean, 0.0)
         rms = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(measured.sum(axis=0), 1))
         from_start = cost.from_one_start(i, recording)  # from the start of the repeats that `cost` compares
         everything = make_comparison(cost.scene, from_start, one.clock, one.config) if recording.repeats > 1 else None
         floor = None if everything is None else _floor(everything)
-        pair = sample_of(rollouts[i], 0), sample_of(rollouts[i], 1)
-        first, last = penalty_free[0, i], penalty_free[1, i]
+        pair = sample_of(replayed[i].rollout, 0), sample_of(replayed[i].rollout, 1)
+        first, last = replayed[i].distance - replayed[i].penalty
         out.append(
             HeldoutDistance(
                 before=float(first),
@@ -222,5 +224,6 @@ def beginning(recording: Recording, seconds: float, config: BeginningConfig = DE
     extent = np.maximum.accumulate(recording.command) - np.minimum.accumulate(recording.command)
     covered = recording.time[int(np.argmax(np.all(extent >= config.covered * extent[-1], axis=1)))]
     starts = recording.time[int(np.argmax(np.any(extent > config.still * extent[-1], axis=1)))]
-    until = max(float(starts) + seconds, float(covered))
+    measured = max((float(c.time[0]) for c in recording.channels.values()), default=begin)
+    until = max(float(starts) + seconds, float(covered) + config.responds, measured + config.responds)
     return recording if until > begin + (end - begin) / config.long else recording.window(begin, until)

@@ -46,7 +46,10 @@ def inspect_log(recording: Recording, scene: Scene | None = None, motion_cutoff:
         found += _said("scene", lambda: _replayable(scene, recording, motion_cutoff))
     if recording.command.size:
         found += _said("start", lambda: warn_if_moving(recording))
-        found += [Finding("scene", "", 0.0, 0.0, "note", text) for text in _notes(scene, recording)]
+        notes = list[str]()
+        errors = _said("scene", lambda: notes.extend(_notes(scene, recording)))
+        found += [error for error in errors if error not in found]
+        found += [Finding("scene", "", 0.0, 0.0, "note", text) for text in notes]
     return _sorted(found)
 
 

@@ -159,7 +159,10 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
         raise ValueError(f'{where}: side must be "motor" or "link", got {shown(columns.side)}')
     if columns.rate is not None and not 0 < columns.rate < 1e5:
         raise ValueError(f"{where}: rate must be above 0 and below 1e5 Hz, got {columns.rate:g}")
-    if strange := [s for s in columns.slides if s not in columns.joints]:
+    entries = [entry for name in CHANNELS if (entry := columns.channel(name)) is not None]
+    known = {*columns.joints, *(joint for entry in entries for joint in entry.joints or ())}
+    unnamed = not columns.joints and any(entry.joints is None for entry in entries)  # the log may name them
+    if not unnamed and (strange := [s for s in columns.slides if s not in known]):
         raise ValueError(f"{where}: slides must be among the joints, got {', '.join(strange)}")
     if columns.damping and len(columns.stiffness) != len(columns.damping):
         raise ValueError(f"{where}: got {len(columns.stiffness)} stiffness and {len(columns.damping)} damping")

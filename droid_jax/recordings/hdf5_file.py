@@ -57,6 +57,8 @@ def demonstrations(path: Path) -> list[str]:
     """Names of the groups that hold one demonstration each, as robomimic's data/demo_0; none in other files."""
     with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
         data: Any = file.get("data", ())
+        if not isinstance(data, h5py.Group):
+            return []
         names = [str(name) for name in data if str(name).startswith("demo_")]
         return [f"data/{name}" for name in sorted(names, key=lambda name: (len(name), name))]
 

@@ -76,10 +76,14 @@ def read_info(path: Path) -> dict[str, Any]:
     return info
 
 
-def usual_map(log: LogColumns) -> ColumnMap:
+def usual_map(log: LogColumns, angle: str | None = None) -> ColumnMap:
     """The map of a dataset: actions are commands, the state is the position, the meta names the joints.
 
     A gripper beside joints in degrees is left out: LeRobot logs it as a share of its travel, which is not stored.
+
+    Args:
+        log: the dataset.
+        angle: unit of its angles, where the user states it.
     """
     if POSITION not in log.widths:
         raise ValueError(f"{log.where}: has no {POSITION!r}, the measured positions; it has: {named(log.widths)}")
@@ -89,10 +93,26 @@ def usual_map(log: LogColumns) -> ColumnMap:
             f"{log.where}: its meta does not name the {log.widths[POSITION]} joints of {POSITION!r}: give --joints"
         )
     joints = [name.removesuffix(POSE) for name in names]
-    if log.units.get(POSITION) == "deg":
+    if (angle or log.units.get(POSITION)) == "deg":
         joints = [joint for joint in joints if "gripper" not in joint]
     command = ChannelMap(COMMAND) if log.widths.get(COMMAND) == log.widths[POSITION] else None
     return ColumnMap(joints=joints, command=command, position=POSITION, time=TimeMap(TIME, "s"), units=Units())
+
+
+def check_gripper(log: LogColumns, columns: ColumnMap) -> None:
+    """ValueError where a map reads the gripper of a dataset in degrees, which LeRobot never records."""
+    entry, names = columns.channel("position"), log.components.get(POSITION, ())
+    if entry is None or entry.columns != POSITION or isinstance(entry.unit, list):
+        return
+    joints = entry.joints or columns.joints
+    read = len(joints) == len(names) or any("gripper" in joint for joint in joints)
+    degrees = (entry.unit or columns.units.angle or log.units.get(POSITION)) == "deg"
+    gripper = next((name for name in names if "gripper" in name), None)
+    if degrees and read and gripper:
+        raise ValueError(
+            f"{log.where}: LeRobot records {shown(gripper)} as a share of its travel, not in degrees: leave it out of "
+            '--joints, or state a unit for each joint in the map ("percent" with its range)'
+        )
 
 
 def _components(feature: Any) -> tuple[str, ...]:

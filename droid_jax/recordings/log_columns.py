@@ -99,10 +99,22 @@ class LogColumns:
         return numbers[:, 0] if numbers.ndim == 2 and numbers.shape[1] == 1 else numbers
 
     def _by_name(self, name: str, joints: Sequence[str]) -> list[str] | None:
-        """The vector's components that have the joints' names, as columns; None where a joint has none."""
-        known = {part.removesuffix(POSE): f"{name}.{part}" for part in self.components.get(name, ())}
-        found = [known.get(joint.removesuffix(POSE)) for joint in joints]
-        return None if None in found or not found else [text for text in found if text is not None]
+        """The vector's components that have the joints' names, as columns; None where these are other names.
+
+        ValueError where only some are known, and not each in its place: the others cannot be taken by position.
+        """
+        parts = [part.removesuffix(POSE) for part in self.components.get(name, ())]
+        asked = [joint.removesuffix(POSE) for joint in joints]
+        places = [parts.index(joint) if joint in parts else None for joint in asked]
+        if not asked or (all(place in (None, number) for number, place in enumerate(places)) and None in places):
+            return None
+        if None in places:
+            unknown = [joint for joint, place in zip(joints, places, strict=True) if place is None]
+            raise ValueError(
+                f"{self.where}: {shown(name)} names its numbers {named(parts)}, and none of them is {named(unknown)}: "
+                "use its names, or list the columns of the map in the order of the joints"
+            )
+        return [f"{name}.{self.components[name][place]}" for place in places if place is not None]
 
     def _found(
         self, columns: str | Sequence[str], joints: Sequence[str], what: str

@@ -42,7 +42,8 @@ def _is_recording(path: Path) -> bool:
     """Whether an npz file is a recording of this or another version, or so damaged that it may be one."""
     try:
         with NpzFile(path) as file:
-            return "format" in file or "metadata" in file
+            recorded = any(name.endswith(".values") for name in file.names)
+            return "format" in file or ("metadata" in file and (recorded or "command" in file))
     except (OSError, ValueError):
         return True
 
@@ -92,7 +93,7 @@ def read_log(
         def changed(known: ColumnMap) -> ColumnMap:
             return changed_map(known, channels or {}, units or {}, torque_constant, **changes)
 
-        found, origin = _known_map(logs[0], paths[0], beside, changed)
+        found, origin = _known_map(logs[0], paths[0], beside, changed, (units or {}).get("angle"))
     elif isinstance(columns, ColumnMap):
         found, origin = columns, "the given map"
     else:
@@ -105,6 +106,8 @@ def read_log(
     found = changed_map(found, channels or {}, units or {}, torque_constant, **changes)
     if not found.joints and (names := _named_joints(logs[0], found)):
         found = changed_map(found, {}, {}, joints=names)
+    if is_dataset(paths[0]):
+        _reader("lerobot").check_gripper(logs[0](None), found)
     recording = read_logs(
         logs,
         found,
@@ -120,11 +123,12 @@ def read_log(
 
 
 def _known_map(
-    log: Opened, path: Path, beside: Path | None, changed: Callable[[ColumnMap], ColumnMap]
+    log: Opened, path: Path, beside: Path | None, changed: Callable[[ColumnMap], ColumnMap], angle: str | None
 ) -> tuple[ColumnMap | None, str]:
     """A known map that fits a log, and where it is from; (None, "") where there is none.
 
-    changed: applies the caller's changes; two maps that are equal after them count as one.
+    changed: applies the caller's changes; two maps that are equal after them count as one.  angle: unit of the angles,
+    where the caller states it.
     """
     near = sorted(beside.glob(f"*{SUFFIX}")) if beside is not None and beside.is_dir() else []
     # Gains belong to one log.  Maps that hold some were written by hand or by an earlier version.
@@ -138,7 +142,7 @@ def _known_map(
             raise ValueError(f"{path}: {newest} and {other} both map its columns, and differ: choose with --map")
         return kept[newest], str(newest)
     if is_dataset(path):
-        return _reader("lerobot").usual_map(log(None)), "its meta"
+        return _reader("lerobot").usual_map(log(None), angle), "its meta"
     for name in layouts():
         columns = read_map(name)
         # A layout without joints is compared by its columns only; the user has to name the joints.

@@ -53,10 +53,12 @@ def in_si(
             raise ValueError(f"{where}: range is for the units {' and '.join(map(repr, NORMALISED))}")
         trivial = np.all(factors * scale == 1.0) and not np.any(zero)
         return numbers if trivial else (numbers - zero) * (factors * scale)
+    if np.any(zero[np.array(normal)]):
+        raise ValueError(f"{where}: range states where normalised positions are; zero is for other units")
     low, high = _range(entry, len(joints), where)
     ends = np.array([NORMALISED.get(unit, (0.0, 1.0)) for unit in units])
     share = (numbers - ends[:, 0]) / (ends[:, 1] - ends[:, 0])
-    return np.where(normal, (low + share * (high - low) - zero) * scale, (numbers - zero) * (factors * scale))
+    return np.where(normal, (low + share * (high - low)) * scale, (numbers - zero) * (factors * scale))
 
 
 def _unit_of_each(entry: ChannelMap, key: str, joints: Sequence[str], columns: ColumnMap, log: LogColumns) -> list[str]:

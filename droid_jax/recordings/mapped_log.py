@@ -65,7 +65,7 @@ def read_logs(
     """
     repeats = [_read(opened, columns, allow_jitter) for opened in logs]
     places = [_first(opened, columns).where for opened in logs]
-    if columns.rate is not None and columns.stamps is not None:
+    if columns.rate is not None and _stamped(columns):
         repeats = _on_one_clock(repeats, columns.rate, places)
     keys = [key for key in CHANNELS if key in repeats[0]]
     commands = [repeat["command"] for repeat in repeats] if "command" in keys else []
@@ -123,6 +123,8 @@ def _read(opened: Opened, columns: ColumnMap, allow_jitter: bool) -> dict[str, _
         if not joints:
             raise ValueError(f"{log.where}: the map names no joints for its {key}: give joints, as the MJCF calls them")
         values = in_si(log.pick(entry.columns, joints, key), entry, key, joints, columns, log)
+        if not len(values):
+            raise ValueError(f"{log.where}, {key}: has no rows")
         place = (entry.file, entry.time)
         if place not in clocks:
             clocks[place] = _clock(log, _stamps(columns, entry), columns.rate, len(values), allow_jitter)
@@ -163,11 +165,13 @@ def _powered(opened: Opened, columns: ColumnMap, found: dict[str, _Series]) -> d
         f"{low - clock[0]:.3g} to {high - clock[0]:.3g} s, the longest interval in which they are on",
         stacklevel=4,
     )
-    return {
-        name: _Series(series.time[inside], series.values[inside])
-        for name, series in found.items()
-        for inside in ((series.time >= low - SLACK) & (series.time <= high + SLACK),)
-    }
+    powered = dict[str, _Series]()
+    for name, series in found.items():
+        inside = (series.time >= low - SLACK) & (series.time <= high + SLACK)
+        if not inside.any():
+            raise ValueError(f"{log.where}, {name}: has no rows while the motors are on")
+        powered[name] = _Series(series.time[inside], series.values[inside])
+    return powered
 
 
 def _joints(columns: ColumnMap, key: str) -> list[str]:
@@ -185,7 +189,13 @@ def _first(opened: Opened, columns: ColumnMap) -> LogColumns:
 
 def _stamps(columns: ColumnMap, entry: ChannelMap) -> TimeMap | None:
     stamps = columns.stamps
-    return stamps if entry.time is None else TimeMap(entry.time, None if stamps is None else stamps.unit)
+    return stamps if entry.time is None else TimeMap(entry.time, columns.units.time if stamps is None else stamps.unit)
+
+
+def _stamped(columns: ColumnMap) -> bool:
+    """Whether a channel of the map has a column of time."""
+    entries = [entry for key in CHANNELS if (entry := columns.channel(key)) is not None]
+    return any(_stamps(columns, entry) is not None for entry in entries)
 
 
 def _clock(log: LogColumns, stamps: TimeMap | None, rate: float | None, rows: int, allow_jitter: bool) -> np.ndarray:
@@ -267,7 +277,7 @@ def _channel(key: str, repeats: Sequence[_Series], columns: ColumnMap) -> Channe
 
 def _meta(places: Sequence[str], log: LogColumns, columns: ColumnMap) -> Mapping[str, str]:
     meta = {"logs": ", ".join(Path(place).name for place in places)[:1000], **log.notes}
-    if columns.rate is not None and columns.stamps is None:
+    if columns.rate is not None and not _stamped(columns):
         meta["rows"] = f"{columns.rate:g} Hz, by their number: the log was read without stamps"
         warnings.warn(
             f"{places[0]}: read without stamps, at the stated {columns.rate:g} Hz; a rate that is off by 1 % looks "

@@ -236,19 +236,14 @@ class Recording:
             if not keep.any():
                 raise ValueError(_outside(f"channel {key!r}", c.time, start, end))
             channels[key] = replace(c, time=c.time[keep], values=c.values[:, keep], mask=c.mask[:, keep])
-        phases = tuple(
-            replace(p, start=max(p.start, start), end=min(p.end, end))
-            for p in self.phases
-            if p.start < end and p.end > start
-        )
-        return replace(
-            self,
-            time=self.time[rows],
-            command=self.command[rows],
-            channels=channels,
-            phases=phases,
-            qpos0=_positions_at(self, start, qpos0 or {}),
-        )
+        begin = max(start, float(self.time[rows][0])) if len(self.time) else start  # where a replay begins
+        cut = replace(
+            self, time=self.time[rows], command=self.command[rows], channels=channels, phases=(),
+            qpos0=_positions_at(self, begin, qpos0 or {}),
+        )  # fmt: skip
+        first, last = cut.span  # of the instants that are kept
+        inside = (replace(p, start=max(p.start, start, first), end=min(p.end, end, last)) for p in self.phases)
+        return replace(cut, phases=tuple(p for p in inside if p.start < p.end))
 
 
 def recordings_of(given: Any) -> tuple[Recording, ...]:

@@ -119,7 +119,8 @@ def read_bags(
         command_names = (*command_joints, *extra["velocity"], *extra["effort"])
         more = [_setpoints(commands[0], clock, field, bags[0]) for field, names in extra.items() if names]
         command = np.concatenate([command, *more], axis=1)
-        gains = gains or _sent_gains(commands, extra, bags)
+        others = len(command_names) - len(command_joints)
+        gains = _sent_gains(commands, extra, bags) if gains is None else _with_none(gains, others)
     recording = Recording(
         name=name or bags[0].stem,
         time=clock if commands else np.zeros(0),
@@ -161,6 +162,13 @@ def _setpoints(command: _Timed, clock: np.ndarray, field: str, bag: Path) -> np.
     if field not in fields or not np.isfinite(fields[field]).all():
         raise ValueError(f"{bag}: the command messages hold no {field} for the {field} actuators, or not throughout")
     return interpolate(clock, time, fields[field])
+
+
+def _with_none(gains: ServoGains, others: int) -> ServoGains:
+    """Gains of the commanded joints, with 0 for the actuators behind them that are no servos."""
+    more = np.zeros(others)
+    damping = None if gains.damping is None else np.r_[gains.damping, more]
+    return ServoGains(np.r_[gains.stiffness, more], damping)
 
 
 def _sent_gains(

@@ -7,6 +7,7 @@ be written by pandas, by numpy's savetxt, or by spreadsheets with decimal commas
 from __future__ import annotations
 
 import contextlib
+import csv
 import gzip
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,6 +43,7 @@ def open_csv(path: Path) -> LogColumns:
         # Counted in the header, where commas cannot belong to a list.
         separator = max(SEPARATORS, key=header.count)
         options: dict[str, Any] = {"separator": separator}
+        _check_names(header, separator, path)
         if names := _names_in_comments(comments, header, separator, path):
             options |= {"has_header": False, "new_columns": names}
         frame = _read(path, options)
@@ -49,10 +51,20 @@ def open_csv(path: Path) -> LogColumns:
             frame = frame.with_columns(_with_points(column) for column in frame if _decimal_commas(column))
         # Names may begin with a space, where one follows the separator.
         names = [name.strip() or f"Unnamed: {i}" for i, name in enumerate(frame.columns)]
-        if len(set(names)) < len(names):
-            raise ValueError(f"{path}, line 1: expected a header of different names, got {shown(names, 200)}")
         frame.columns = names
         return _columns(str(path), frame)
+
+
+def _check_names(header: str, separator: str, path: Path) -> None:
+    """ValueError where two columns have one name, which polars would change: q1 to q1_duplicated_0."""
+    names = [name.strip() for name in next(csv.reader([header], delimiter=separator), [])]
+    if all(_text_width(name) for name in names):  # numbers: the names are in a comment
+        return
+    if twice := [name for name in dict.fromkeys(names) if name and names.count(name) > 1]:
+        raise ValueError(
+            f"{path}: expected a header of different names, but {shown(twice[0])} stands over {names.count(twice[0])} "
+            f"columns of {shown(names, 200)}"
+        )
 
 
 def _read(path: Path, options: dict[str, Any]) -> pl.DataFrame:

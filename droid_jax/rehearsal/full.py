@@ -31,7 +31,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.read_json import read_json
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import roles_of, split_of
-from droid_jax.rehearsal.linear import DEFAULT_REHEARSAL, RehearsalConfig
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig
 from droid_jax.rehearsal.linearised import Rehearsed, one_shape_each
 from droid_jax.rehearsal.plan import (
     HiddenCase,

@@ -31,7 +31,8 @@ from droid_jax.model.parameters import Space
 from droid_jax.model.scene import Scene, with_options
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import FEWEST_REPEATS, Split, roles_of, split_of
-from droid_jax.rehearsal.linear import DEFAULT_REHEARSAL, LinearModel, LinearPart, RehearsalConfig
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig
+from droid_jax.rehearsal.linear import LinearModel, LinearPart
 from droid_jax.rehearsal.plan import ColumnNoise, RehearsalPlan, noise_of_log, planned_recording, simulated_channels
 from droid_jax.simulate.replay import Drive
 

@@ -21,7 +21,7 @@ from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.recordings.time_scaling import TimeScaling, time_scaled
-from droid_jax.rehearsal.linear import DEFAULT_REHEARSAL, RehearsalConfig
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig
 from droid_jax.simulate.batching import in_blocks
 from droid_jax.simulate.compiled import compiled_replay
 from droid_jax.simulate.replay import Drive

@@ -16,7 +16,9 @@ import scipy.stats
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.statistics import Blocks, Repeats, detrended, sign_flips, t_values
 from droid_jax.discrepancy.step_error import FIRST_ORDER_RATIO
-from droid_jax.rehearsal.linear import LinearModel, RehearsalConfig, Unabsorbed, unabsorbed, weak_imitation_limit
+from droid_jax.rehearsal.config import RehearsalConfig
+from droid_jax.rehearsal.imitations import weak_imitation_limit
+from droid_jax.rehearsal.linear import LinearModel, Unabsorbed, unabsorbed
 
 HALVINGS = 8  # of the range of noncentralities, in logarithms
 

@@ -24,15 +24,9 @@ from droid_jax.model.scene import Scene
 from droid_jax.recordings.clocks import interpolate
 from droid_jax.recordings.recording import Recording
 from droid_jax.recordings.split import Split
-from droid_jax.rehearsal.linear import (
-    DEFAULT_REHEARSAL,
-    LinearModel,
-    RehearsalConfig,
-    alternatives_of,
-    distinguishable,
-    explained_shares,
-    unabsorbed_part,
-)
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig
+from droid_jax.rehearsal.imitations import alternatives_of, distinguishable, explained_shares
+from droid_jax.rehearsal.linear import LinearModel, unabsorbed_part
 from droid_jax.rehearsal.linearised import Rehearsed, ReportStage, one_shape_each, rehearsed
 from droid_jax.rehearsal.plan import (
     HiddenCase,

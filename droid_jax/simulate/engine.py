@@ -23,6 +23,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.model.variant import variant_scene
 from droid_jax.recordings.recording import Recording
 from droid_jax.simulate.c_reference import why_not_in_c
+from droid_jax.simulate.replay import replayed_torque
 
 ENGINES = ("mjx", "mujoco")
 CHOICES = ("auto", *ENGINES)
@@ -64,7 +65,9 @@ def choose_engine(
         return EngineChoice("mjx", "repeats resolve the error of C's first-order steps")
     if scene.has_contacts:
         return EngineChoice("mjx", "contact pairs need its second-order step")
-    reasons = [why_not_in_c(variant_scene(scene, r.variant, r.name), space, r.torque, effects) for r in recordings]
+    reasons = [
+        why_not_in_c(variant_scene(scene, r.variant, r.name), space, replayed_torque(r), effects) for r in recordings
+    ]
     if reason := next(filter(None, reasons), None):
         return EngineChoice("mjx", reason)
     case = f"for {samples} samples a batch" if accelerated else "on a CPU"

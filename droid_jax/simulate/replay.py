@@ -93,6 +93,11 @@ def end_on(recording: Recording, timestep: float) -> float:
     return timestep * float(np.floor((recording.time[-1] - recording.time[0]) / timestep + 1e-6))
 
 
+def replayed_torque(recording: Recording) -> TorqueConvention:
+    """The convention of the torques of a replay: the recording's; that of any actuator if none were measured."""
+    return recording.torque if "torque" in recording.channels else TorqueConvention(TorqueSide.MOTOR, gravity=False)
+
+
 def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config: StartConfig = DEFAULT_START) -> Drive:
     """Resample a recording's command onto the simulation's clock, in the order of the scene's actuators.
 
@@ -134,7 +139,7 @@ def make_drive(scene: Scene, recording: Recording, *, weigh: bool = True, config
         command=command,
         qpos0=qpos0,
         timestep=timestep,
-        torque=recording.torque,
+        torque=replayed_torque(recording),
         stiffness=stiffness,
         damping=damping,
         sent=columns >= 0,

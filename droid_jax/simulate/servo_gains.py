@@ -24,15 +24,15 @@ _VELOCITY = 2  # column of the velocity gain
 
 
 def check_gains(scene: Scene, drive: Drive) -> None:
-    """Raise ValueError if a recording states another gain for an actuator that is no position servo."""
+    """Raise ValueError if a recording states another gain for an actuator that is no position servo; 0 states none."""
     if drive.stiffness is None:
         return
     rows = zip(scene.command_names, drive.stiffness, scene_stiffness(scene), position_servos(scene.model), strict=True)
     for name, stated, of_scene, servo in rows:
-        if not servo and not np.isclose(stated, of_scene, rtol=EQUAL):
+        if not servo and stated != 0.0 and not np.isclose(stated, of_scene, rtol=EQUAL):
             raise ValueError(
                 f"the recording states a servo gain of {stated:g} for {name}, the scene has {of_scene:g} and its "
-                "actuator is no position servo; make it a <position> servo in the MJCF"
+                "actuator is no position servo; make it a <position> servo in the MJCF, or state 0"
             )
 
 

@@ -28,7 +28,7 @@ def test_a_log_is_whitened_as_by_its_cost(log: LoneLog):
     values = elbow_space(scene).mean
     whole = log.space.mean
     stated = cost.with_estimated_noise(values)
-    deviation = 1 / stated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
+    deviation = 1 / stated.comparisons[0].channel("torque").noise.weight[0, 0]
     everywhere = np.ones(len(log.clock), bool)
     own = log.with_noise(np.array([deviation]), everywhere)
     np.testing.assert_allclose(own.whitened(whole[None]), stated.whitened(values[None]), atol=1e-3)

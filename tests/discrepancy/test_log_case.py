@@ -90,7 +90,7 @@ def test_each_joint_of_a_test_log_has_its_own_noise():
 
     def deviations(residual_set: ResidualSet) -> dict[int, float]:
         torque = residual_set.comparison.channel("torque")
-        return dict(zip(torque.columns.tolist(), 1 / torque.noise.whitener.max(axis=(1, 2)), strict=True))
+        return dict(zip(torque.columns.tolist(), 1 / torque.noise.weight.max(axis=0), strict=True))
 
     assert case.test is not None and list(deviations(case.test)) == list(deviations(case.train)) == [0, 1]
     assert deviations(case.test) == deviations(case.validation) == deviations(case.train)

@@ -8,6 +8,7 @@ import json
 import pickle
 import re
 import sys
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any, Literal
@@ -108,6 +109,52 @@ def test_what_was_recorded_with_the_motors_off_is_left_out(tmp_path: Path):
 
 
 pytest.importorskip("polars", reason="tables are read with polars; it comes with the extra 'formats'")
+
+
+def test_logs_that_lack_rows_or_say_something_twice(tmp_path: Path):
+    """Regressions: polars renames the second column of a name, and logs without rows ended in an IndexError."""
+    path = tmp_path / "twice.csv"
+    lines = log(path).read_text().splitlines()
+    path.write_text("\n".join([lines[0].replace("cmd9", "q9"), *lines[1:]]))
+    assert "'q9' stands over 2 columns" in refused(path, whole())
+    np.savez(tmp_path / "empty.npz", t=np.zeros(0), q=np.zeros((0, 2)))
+    assert "position: has no rows" in refused(
+        tmp_path / "empty.npz", ColumnMap(JOINTS, time="t", position="q", units=RAD)
+    )
+
+
+def test_time_columns_of_each_channel_alone(tmp_path: Path):
+    """Regression: the rate and the unit of time were ignored where no column of time is stated for all channels."""
+    path = tmp_path / "log.npz"
+    np.savez(path, t_cmd=1000 * TIME, t_q=1000 * (TIME + 0.0003 * np.sin(40 * TIME)), cmd=COMMAND, q=POSITION)
+    columns = ColumnMap(
+        list(JOINTS), command=ChannelMap("cmd", time="t_cmd"), position=ChannelMap("q", time="t_q"), rate=100.0,
+        units=Units(angle="rad", time="ms"),
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = load_recording(path, columns=columns)
+    assert found.time == pytest.approx(TIME[: len(found.time)], abs=1e-6) and "rows" not in found.meta
+    np.testing.assert_array_equal(found.channels["position"].time, found.time)
+
+
+def test_a_sliding_object_and_a_zero_beside_a_range(tmp_path: Path):
+    path = log(tmp_path / "a.csv", drawer=1000 * POSITION[:, 0])
+    drawer = ChannelMap("drawer", joints=["drawer"], unit="mm")
+    columns = changed_map(whole(object_angle=drawer, slides=["drawer"]), {}, {})
+    assert load_recording(path, columns=columns).channels["object_angle"].values[0, :, 0] == pytest.approx(
+        POSITION[:, 0]
+    )
+    shifted = ChannelMap("q{n}", unit="normalised", range=[-1.9, 1.9], zero=0.5)
+    assert "zero is for other units" in refused(path, whole(position=shifted))
+
+
+def test_an_npz_with_metadata_of_its_own_is_a_log(tmp_path: Path):
+    np.savez(tmp_path / "log.npz", t=TIME, q=POSITION, metadata="{}")
+    columns = ColumnMap(list(JOINTS), time="t", position="q", units=RAD)
+    assert load_recording(tmp_path / "log.npz", columns=columns).channels["position"].values[0] == pytest.approx(
+        POSITION
+    )
 
 
 @pytest.mark.parametrize(("name", "separator"), [("a.csv", ","), ("a.csv.gz", ";"), ("a.tsv", "\t")])
@@ -538,6 +585,17 @@ def test_lerobot_asks_for_a_unit_that_the_numbers_leave_open(tmp_path: Path):
     check(found, 1e-5, position=POSITION)
     turned = load_recording(path, episodes=[0], units={"angle": "deg"}, joints=JOINTS[::-1])
     assert turned.command == pytest.approx(COMMAND[:, ::-1], abs=1e-5)  # by name, in the order wanted
+
+
+def test_lerobot_records_no_gripper_in_degrees(tmp_path: Path):
+    """Regression: where the user stated degrees, the gripper's percentage was read as degrees."""
+    path = dataset(tmp_path / "set", "v3.0", degrees=False)
+    degrees = {"angle": "deg"}
+    assert load_recording(path, episodes=[0], units=degrees).command_names == JOINTS
+    for joints in ((*JOINTS, "gripper"), (*JOINTS, "jaw")):
+        assert "records 'gripper.pos' as a share" in refused(path, episodes=[0], units=degrees, joints=joints)
+    mixed = refused(path, episodes=[0], units=degrees, joints=("elbow", "jaw"))
+    assert "none of them is jaw" in mixed  # not by position: the first is known by name
 
 
 def test_lerobot_of_another_version(tmp_path: Path):

@@ -333,6 +333,14 @@ def test_window_cuts_clocks_and_phases_and_finds_the_positions() -> None:
     assert r.window(0.0, 0.6).qpos0 == r.qpos0
 
 
+def test_window_between_two_samples_ends_where_its_samples_do() -> None:
+    """Regression: phases ended at the asked time, which validation refuses, and the pose was that of the asked time."""
+    part = validate(make().window(0.3033, 0.6077))
+    assert part.phases == (Phase("approach", pytest.approx(0.31), 0.4), Phase("opening", 0.4, pytest.approx(0.6)))
+    assert part.qpos0["j1"] == pytest.approx(1.31)  # of the first command that is kept
+    assert validate(make().window(0.3992, 0.6)).phases == (Phase("opening", 0.4, pytest.approx(0.6)),)
+
+
 def test_window_says_what_it_lacks() -> None:
     r = make()
     with pytest.raises(ValueError, match=r"too little of the command, which runs 0 \.\. 1 s"):

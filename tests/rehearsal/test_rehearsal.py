@@ -32,6 +32,7 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
+from droid_jax.rehearsal.config import RehearsalConfig
 from droid_jax.rehearsal.full import (
     FullRehearsal,
     HiddenCase,
@@ -41,7 +42,8 @@ from droid_jax.rehearsal.full import (
     scores,
     synthetic_log,
 )
-from droid_jax.rehearsal.linear import LinearModel, LinearPart, RehearsalConfig, alternatives_of, unabsorbed
+from droid_jax.rehearsal.imitations import alternatives_of
+from droid_jax.rehearsal.linear import LinearModel, LinearPart, unabsorbed
 from droid_jax.rehearsal.linearised import fine_steps, rehearsed
 from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import _some_flips, smallest_sizes

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from two_link import JOINTS, arm, recording
+from two_link import JOINTS, MOTOR, arm, measured, recording
 
 from droid_jax import distributed, runtime
 from droid_jax.cost.cost import make_cost
@@ -19,6 +19,7 @@ from droid_jax.model.joint_friction import joint_friction_effect, joint_friction
 from droid_jax.model.parameters import Space
 from droid_jax.recordings.recording import Recording, TorqueConvention, TorqueSide
 from droid_jax.simulate.engine import choose_engine
+from droid_jax.simulate.replay import make_drive
 
 ONE = recording().repeats_subset([0])
 SPACE = Space((joint_damping(arm(), "shoulder", std=1.0, high=20.0),))
@@ -39,6 +40,14 @@ def test_a_log_of_one_repeat_is_replayed_in_c():
 def test_features_that_c_lacks_are_replayed_in_mjx(given: Recording, why: str):
     choice = choose_engine(arm(), SPACE, [ONE, given])
     assert choice.engine == "mjx" and why in choice.why
+
+
+def test_the_convention_of_torques_that_were_not_measured_is_no_reason_for_mjx():
+    """Regression: positions alone, declared link-side, were refused by C."""
+    channels = {"position": measured(0.0)["position"]}
+    alone = recording(channels=channels, torque=TorqueConvention(TorqueSide.LINK, True)).repeats_subset([0])
+    assert choose_engine(arm(), SPACE, [alone]).engine == "mujoco"
+    assert make_drive(arm(), alone).torque == make_drive(arm(), replace(alone, torque=MOTOR)).torque
 
 
 def test_parameters_and_effects_of_sensors_are_replayed_in_mjx():

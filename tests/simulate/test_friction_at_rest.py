@@ -165,6 +165,6 @@ def test_residuals_at_rest_are_not_used_for_noise():
     moves = cost.comparisons[0].channel("torque").moves
     assert 0.5 < moves.mean() < 0.9
     estimated = cost.with_estimated_noise(space.mean)
-    noise = 1.0 / estimated.comparisons[0].channel("torque").noise.whitener[0, 0, 0]
+    noise = 1.0 / estimated.comparisons[0].channel("torque").noise.weight[0, 0]
     left = cost.comparisons[0].channel("torque").noise.mean - cost.smoothed(space.mean[None])[0][0]
     assert noise >= np.sqrt(np.mean(left[moves] ** 2))

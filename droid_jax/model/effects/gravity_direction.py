@@ -1,5 +1,6 @@
-"""A base that is not level: gravity has another direction than in the model and in the gravity compensation."""
+"""Gravity that pulls in another direction than in the model: a base that is not level, a door frame out of plumb."""
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -12,6 +13,7 @@ from droid_jax.model.scene import Scene
 NAME = "gravity_about"
 LEAST_TORQUE = 1e-3  # N m/rad, an axis about which a tilt changes all joint torques by less is left out
 POSES = 20  # at which this is tested
+SINE, COSINE = "tilt_sine", "tilt_cosine"
 
 
 @register
@@ -81,3 +83,27 @@ def _largest_torque(scene: Scene, axis: int) -> float:
         mujoco.mj_rne(model, data, 0, weight)
         most = max(most, float(np.abs(weight[a.arm_dofs(scene)]).max()))
     return most
+
+
+@register
+def tilted_frame(scene: Scene) -> Effect | None:
+    """-(A sin phi + B cos phi) on the hinge, N m: m g d sin(alpha) for tilts forward and sideways."""
+    joint = a.hinge(scene)
+    if joint is None:
+        return None
+
+    def force(theta, state):
+        phi = a.angle(scene, joint, state)
+        return a.at_dof(scene, joint, -(a.value(theta, SINE) * jnp.sin(phi) + a.value(theta, COSINE) * jnp.cos(phi)))
+
+    return Effect(
+        "tilted_frame",
+        (a.coefficient(SINE, "N m", 0.3, 3.0), a.coefficient(COSINE, "N m", 0.3, 3.0)),
+        force=force,
+        description="a frame out of plumb, so that gravity moves the door",
+        signature="smooth over the angle, the same at every speed and in both directions",
+        confused_with=("hinge_preload", "hardening_spring"),
+        special_cases=("hinge_preload",),  # A = 0, over a small range of angles
+        locations={joint: (SINE, COSINE)},
+        minimum_size=0.05,
+    )

@@ -1,4 +1,4 @@
-"""Dry friction of the arm's joints that does not creep, as MuJoCo's soft constraint does."""
+"""Constraints that are softer or firmer than the model's: dry friction of joints, contacts of the fingers."""
 
 from droid_jax.model.effect_interface import Effect
 from droid_jax.model.effects import coefficients as a
@@ -9,6 +9,7 @@ from droid_jax.model.scene import Scene
 
 FIRM = 0.9999  # mjMAXIMP, the largest impedance of a MuJoCo constraint
 FIRMNESS = "friction_firmness"
+SOFTNESS = "contact_softness"
 EVERYWHERE = "all joints"  # all joints share MuJoCo's default, and each alone may be below the minimum effect size
 
 
@@ -42,4 +43,24 @@ def soft_friction(scene: Scene) -> Effect | None:
         locations={**a.locations(tuple(writes), FIRMNESS), **together},
         minimum_size=0.1,
         natural_bounds=tuple(names.values()),
+    )
+
+
+@register
+def contact_compliance(scene: Scene) -> Effect | None:
+    """The contacts' time constant (solref) times 1 + s."""
+    if scene.grip is None:
+        return None
+    pairs = [scene.id("pair", pair) for finger in scene.grip.fingers for pair in finger]
+    if (scene.model.pair_solref[pairs, 0] <= 0).any():  # solref states stiffness and damping, no time constant
+        return None
+    writes = tuple(write(scene, "pair_solref", (pair, 0), Mode.SCALE, offset=1.0) for pair in pairs)
+    return Effect(
+        "contact_compliance",
+        (Parameter(SOFTNESS, "-", 0.0, 0.5, -0.5, 12.0, writes=writes, group=a.GROUP),),
+        description="fingertips or a knob that are softer than the model's",
+        signature="grasp and breakaway, the peaks of the load",
+        confused_with=("hinge_stribeck", "joint_compliance"),
+        locations={"grip": (SOFTNESS,)},
+        minimum_size=0.2,
     )
