@@ -25,6 +25,8 @@ from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
 
+SHARES = (1.0, 0.5, 0.25, 0.125)  # of the coefficients of a sensitivity, at which an effect is tried
+
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
@@ -111,10 +113,10 @@ def one_step_fits(
 ) -> list[tuple[np.ndarray, float]]:
     """Models with one more effect each, after one Levenberg-Marquardt step with known slopes, all in the same batches.
 
-    Each effect has three starts: its proposed coefficients, neutral, and where its sensitivity was taken.  A step moves
-    a parameter by at most two prior deviations, and the coefficient of a strong effect may be larger.  An effect that
-    begins at a threshold, such as a limit of torque, has no slope at neutral and perhaps none at the proposal.  The
-    best end is returned.
+    Each effect has three starts: its proposed coefficients, neutral, and the best of some shares of the coefficients at
+    which its sensitivity was taken (`_scanned`).  A step moves a parameter by at most two prior deviations, and the
+    coefficient of a strong effect may be larger.  An effect that begins at a threshold, such as a limit of torque, has
+    no slope at neutral and perhaps none at the proposal.  The best end is returned.
 
     Args:
         residual_set: of the fitted recording.
@@ -127,8 +129,8 @@ def one_step_fits(
         Values [D] and objective of each effect's model.
     """
     whole = residual_set.cost.space
-    looks = list[Look]()
-    for part, sensitivities, proposed in asked:
+    looks, scanned = list[Look](), _scanned(residual_set, model, [(part, start) for part, _, start in asked])
+    for (part, sensitivities, proposed), tried in zip(asked, scanned, strict=True):
         space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
         jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
         jacobian[:, space.columns(model.space)] = model.refined.jacobian
@@ -136,14 +138,34 @@ def one_step_fits(
             jacobian[:, space.index(name)] = sensitivities[name] * space[name].std * np.sqrt(residual_set.repeats)
         without, coefficients = proposed.copy(), [whole.index(name) for name in part.coefficients]
         without[coefficients] = model.values[coefficients]
-        tried = without.copy()
-        for name, at in zip(part.coefficients, coefficients, strict=True):
-            step = from_neutral(whole[name], residual_set.config.sensitivity_step)
-            tried[at] = whole[name].mean + math.copysign(step, proposed[at] - whole[name].mean or step)
-        starts = np.clip(np.stack([without, proposed, tried]), whole.low, whole.high)[:, whole.columns(space)]
+        starts = np.stack([without, proposed, tried])[:, whole.columns(space)]
         looks.append(Look(space, starts, jacobian, functools.partial(whole.embed, space, values=without)))
     ends = chords(residual_set.whitened, looks, config)
     return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ends, strict=True)]
+
+
+def _scanned(
+    residual_set: ResidualSet, model: FittedModel, asked: Sequence[tuple[Candidate, np.ndarray]]
+) -> list[np.ndarray]:
+    """Values [D] of each effect's model at one of SHARES of the coefficients at which its sensitivity was taken.
+
+    It is the share that leaves least to the residual after the base parameters have absorbed their part of it.  All are
+    replayed in one batch.
+
+    asked: of each effect its candidate, and values [D] of the model with its proposed coefficients.
+    """
+    whole, rows = residual_set.cost.space, list[np.ndarray]()
+    for part, proposed in asked:
+        for share in SHARES:
+            row = proposed.copy()
+            for name in part.coefficients:
+                neutral, at = whole[name].mean, whole.index(name)
+                step = from_neutral(whole[name], residual_set.config.sensitivity_step)
+                row[at] = neutral + share * math.copysign(step, proposed[at] - neutral or step)
+            rows.append(np.clip(row, whole.low, whole.high))
+    left = project(residual_set.whitened(np.stack(rows)), model.refined.jacobian, model.refined.prior)
+    squares = np.nan_to_num(np.sum(left**2, axis=1), nan=np.inf).reshape(len(asked), len(SHARES))
+    return [rows[len(SHARES) * k + int(best)] for k, best in enumerate(np.argmin(squares, axis=1))]
 
 
 def base_fit(
