@@ -47,7 +47,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.3, "identify": 4.0, "gap": 7.5, "train": 6.0, "evaluate": 1.1}
+MINUTES = {"record": 0.5, "identify": 2.9, "gap": 5.9, "train": 6.6, "evaluate": 1.7}
 """Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
