@@ -241,7 +241,7 @@ def report(case: Case, verdict: Verdict) -> dict[str, Any]:
             role: {"before": b, "after": a, "closed": 1 - a / b} for role, (b, a) in verdict.discrepancies.items()
         },
         "rms": {role: _rms_of(case, verdict, role) for role in ("train", "validation", "test")},
-        "noise_stated": rounded(1 / np.einsum("ckk->kc", torque.noise.whitener).max(axis=0)),
+        "noise_stated": rounded(1 / torque.noise.weight.max(axis=0)),
         "blocks": {"each": case.train.resampling.units, "seconds": round(_block_seconds(case), 3)},
         "where": [
             {**asdict(b.key), "axis": b.key.axis.value, "before": b.discrepancy, "after": a.discrepancy}

@@ -16,7 +16,7 @@ from benchmarks.check_cases import measured as recorded_channels
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
 from droid_jax.identify.additions import Addition, MotionProposal, additions, motion_recording, propose
-from droid_jax.identify.excitation import Excitation, ExcitationConfig, identifiability_of
+from droid_jax.identify.excitation import Excitation, ExcitationConfig, excitation, identifiability_of
 from droid_jax.identify.holdout import beginning
 from droid_jax.model.fields import joint_damping
 from droid_jax.model.parameters import Space
@@ -277,6 +277,29 @@ def test_proposed_motions_of_a_geared_slide_are_in_its_own_unit():
     positions = CompareConfig(channels={"position": 1.0})
     cost = make_cost(scene, space, made, config=positions, check=False)  # its placeholders are inside the ranges
     assert np.isfinite(cost(space.mean[None])).all()
+
+
+def test_a_proposed_motion_may_leave_a_torque_constant():
+    """Regression: the torque of a vertical slide beside one that moves was taken for a dead sensor."""
+    xml = """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+    <geom size=".1" mass="1"/><body><joint name="z" type="slide" axis="0 0 1" range="-1 1" limited="true"/>
+    <geom size=".1" mass=".7"/></body></body></worldbody></mujoco>"""
+    scene = compile_scene(mujoco.MjSpec.from_string(xml), "gantry", joints=["x", "z"])
+    time = np.arange(0.0, 5.0, 0.01)
+    moved = np.column_stack([0.1 * (1 - np.cos(time)), 0.1 * (1 - np.cos(2 * time))])[None]
+    force = np.column_stack([0.17 * np.cos(time), 6.87 + 0.28 * np.cos(2 * time)])[None]
+    force = force + np.random.default_rng(0).normal(scale=0.01, size=force.shape)
+    every = np.ones(moved.shape, bool)
+    channels = {
+        "position": Channel("position", "m", ("x", "z"), time, moved, every),
+        "torque": Channel("torque", "N", ("x", "z"), time, force, every),
+    }
+    log = Recording("gantry", np.zeros(0), np.zeros((0, 0)), (), channels, replace(MOTOR, gravity=True))
+    space = Space((joint_damping(scene, "x", std=1.0, high=9.0), joint_damping(scene, "z", std=1.0, high=9.0)))
+    found = excitation(scene, space, [log])
+    nothing = identifiability_of(space, np.zeros((2, 2)), found.config.identifiability)
+    proposal = propose(scene, space, replace(found, identifiability=nothing), log)
+    assert proposal.tried > 0 and proposal.why == ""
 
 
 def test_a_beginning_ends_when_the_last_joint_has_moved():

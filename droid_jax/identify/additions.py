@@ -256,10 +256,10 @@ def _information(
 
 
 def _with_torques(scene: Scene, motion: Recording, rollout: Rollout) -> Recording:
-    """A recording whose torques are those of its replay [1, T, ...]."""
+    """A recording whose torques are those of its replay [1, T, ...]; they rise as its placeholders did."""
     channel = motion.channels["torque"]
     torque = interpolate(channel.time, np.asarray(rollout.time[0]), np.asarray(rollout.torque[0]))
-    values = torque[None, :, [scene.joints.index(j) for j in channel.columns]]
+    values = channel.values + torque[:, [scene.joints.index(j) for j in channel.columns]]
     return replace(motion, channels={**motion.channels, "torque": replace(channel, values=values)})
 
 

@@ -167,7 +167,8 @@ def check_map(columns: ColumnMap, where: str) -> ColumnMap:
     if columns.damping and len(columns.stiffness) != len(columns.damping):
         raise ValueError(f"{where}: got {len(columns.stiffness)} stiffness and {len(columns.damping)} damping")
     stamps = columns.stamps
-    units = [] if stamps is None or stamps.unit is None else as_list(stamps.unit)
+    unit = columns.units.time if stamps is None else stamps.unit
+    units = [] if unit is None else as_list(unit)
     if wrong := [unit for unit in units if unit not in TIMES]:
         raise ValueError(f"{where}: {wrong[0]!r} is no unit of time; known are: {', '.join(TIMES)}")
     return columns

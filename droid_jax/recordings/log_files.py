@@ -16,7 +16,7 @@ from droid_jax.errors import named, needs
 from droid_jax.read_npz import NpzFile
 from droid_jax.recordings.column_map import SUFFIX, ColumnMap, changed_map, layouts, read_map
 from droid_jax.recordings.log_columns import INFO, LogColumns, width_of
-from droid_jax.recordings.mapped_log import Opened, fits, read_logs
+from droid_jax.recordings.mapped_log import Opened, fits, read_logs, stamped
 from droid_jax.recordings.recording import Phase, Recording
 from droid_jax.recordings.units import with_torque_constants
 
@@ -154,10 +154,8 @@ def _known_map(
 
 def _alike(one: ColumnMap, other: ColumnMap) -> bool:
     """Whether two maps read the same numbers, possibly at different rates."""
-    rate = one.rate if one.stamps is None else None
-    return msgspec.structs.replace(one, rate=rate) == msgspec.structs.replace(
-        other, rate=other.rate if other.stamps is None else None
-    )
+    one, other = (msgspec.structs.replace(m, rate=None if stamped(m) else m.rate) for m in (one, other))
+    return one == other
 
 
 def _named_joints(log: Opened, columns: ColumnMap) -> tuple[str, ...]:

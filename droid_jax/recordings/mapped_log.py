@@ -65,7 +65,7 @@ def read_logs(
     """
     repeats = [_read(opened, columns, allow_jitter) for opened in logs]
     places = [_first(opened, columns).where for opened in logs]
-    if columns.rate is not None and _stamped(columns):
+    if columns.rate is not None and stamped(columns):
         repeats = _on_one_clock(repeats, columns.rate, places)
     keys = [key for key in CHANNELS if key in repeats[0]]
     commands = [repeat["command"] for repeat in repeats] if "command" in keys else []
@@ -192,7 +192,7 @@ def _stamps(columns: ColumnMap, entry: ChannelMap) -> TimeMap | None:
     return stamps if entry.time is None else TimeMap(entry.time, columns.units.time if stamps is None else stamps.unit)
 
 
-def _stamped(columns: ColumnMap) -> bool:
+def stamped(columns: ColumnMap) -> bool:
     """Whether a channel of the map has a column of time."""
     entries = [entry for key in CHANNELS if (entry := columns.channel(key)) is not None]
     return any(_stamps(columns, entry) is not None for entry in entries)
@@ -277,7 +277,7 @@ def _channel(key: str, repeats: Sequence[_Series], columns: ColumnMap) -> Channe
 
 def _meta(places: Sequence[str], log: LogColumns, columns: ColumnMap) -> Mapping[str, str]:
     meta = {"logs": ", ".join(Path(place).name for place in places)[:1000], **log.notes}
-    if columns.rate is not None and not _stamped(columns):
+    if columns.rate is not None and not stamped(columns):
         meta["rows"] = f"{columns.rate:g} Hz, by their number: the log was read without stamps"
         warnings.warn(
             f"{places[0]}: read without stamps, at the stated {columns.rate:g} Hz; a rate that is off by 1 % looks "

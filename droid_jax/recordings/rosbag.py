@@ -119,8 +119,7 @@ def read_bags(
         command_names = (*command_joints, *extra["velocity"], *extra["effort"])
         more = [_setpoints(commands[0], clock, field, bags[0]) for field, names in extra.items() if names]
         command = np.concatenate([command, *more], axis=1)
-        others = len(command_names) - len(command_joints)
-        gains = _sent_gains(commands, extra, bags) if gains is None else _with_none(gains, others)
+        gains = _sent_gains(commands, extra, bags) if gains is None else _of_all(gains, command_joints, command_names)
     recording = Recording(
         name=name or bags[0].stem,
         time=clock if commands else np.zeros(0),
@@ -164,9 +163,11 @@ def _setpoints(command: _Timed, clock: np.ndarray, field: str, bag: Path) -> np.
     return interpolate(clock, time, fields[field])
 
 
-def _with_none(gains: ServoGains, others: int) -> ServoGains:
-    """Gains of the commanded joints, with 0 for the actuators behind them that are no servos."""
-    more = np.zeros(others)
+def _of_all(gains: ServoGains, joints: Sequence[str], actuators: Sequence[str]) -> ServoGains:
+    """Gains of the commanded joints, with 0 for the actuators behind them that are no servos; unchanged if of all."""
+    if len(gains.stiffness) != len(joints):
+        return gains
+    more = np.zeros(len(actuators) - len(joints))
     damping = None if gains.damping is None else np.r_[gains.damping, more]
     return ServoGains(np.r_[gains.stiffness, more], damping)
 

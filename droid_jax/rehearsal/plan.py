@@ -80,6 +80,7 @@ def simulated_channels(
     """
     scene = variant_scene(scene, recording.variant, recording.name)
     drive = followed(scene, recording, config.compare)
+    drive = replace(drive, torque=recording.torque)  # also of torques that were not measured yet
     replay = compiled_replay(engine, scene, space, drive, effects)
     rollout = jax.tree.map(lambda a: np.asarray(a)[0], in_blocks(replay, values[None]))
     if not bool(rollout.finite):

@@ -68,7 +68,7 @@ def described_in(path: Path) -> dict[str, Any]:
 def _read(path: Path, kind: type) -> dict[str, Any]:
     try:
         content = read_json(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return {}
     except ValueError as error:
         raise ValueError(f"{error}; {_MEND}") from None

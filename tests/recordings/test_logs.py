@@ -136,6 +136,8 @@ def test_time_columns_of_each_channel_alone(tmp_path: Path):
         found = load_recording(path, columns=columns)
     assert found.time == pytest.approx(TIME[: len(found.time)], abs=1e-6) and "rows" not in found.meta
     np.testing.assert_array_equal(found.channels["position"].time, found.time)
+    with pytest.raises(ValueError, match="'msec' is no unit of time"):
+        changed_map(columns, {}, {"time": "msec"})
 
 
 def test_a_sliding_object_and_a_zero_beside_a_range(tmp_path: Path):
