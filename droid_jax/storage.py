@@ -123,6 +123,17 @@ def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
         write_bytes(folder / name, content)
 
 
+def remove_own(folder: Path) -> None:
+    """Remove the files that `write_own` wrote in a folder and that are unchanged, and the folder if nothing is left."""
+    for name, known in _written(folder).items():
+        path = folder / name
+        if path.is_file() and file_sha256(path) in known:
+            path.unlink()
+    if {path.name for path in folder.iterdir()} <= {WRITTEN}:
+        (folder / WRITTEN).unlink(missing_ok=True)
+        folder.rmdir()
+
+
 def _written(folder: Path) -> dict[str, list[str]]:
     """SHA-256 of all contents that `write_own` wrote in the folder, by name; empty where there is no such file."""
     from droid_jax.read_json import read_json, typed  # only here: it imports this module

@@ -564,6 +564,7 @@ def gasket(scene):
 def library(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[str, ...]]:
     """Names in the library of effects, which is as it was after the test."""
     registry.registered()
+    registry.registered()  # those of the library, which are registered once in a process
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
     return registry.registered
 

@@ -278,6 +278,7 @@ def test_a_log_without_commands_has_no_servo_to_suspect():
 def test_an_effect_that_cannot_be_neutral(
     place: Path, refused, monkeypatch: pytest.MonkeyPatch, make: Callable[[], Parameter], expected: str
 ):
+    registry.registered()  # those of the library, which are registered once in a process
     monkeypatch.setattr(registry, "_MAKERS", dict(registry._MAKERS))
 
     @registry.register

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from droid_jax.files import CONFIG, EVALUATION, EVALUATION_TRACES, LAST_FILES, RESULTS, SETUP
 from droid_jax.read_json import read_json, typed
 from droid_jax.report.stages import Setup, to_be_amended
-from droid_jax.storage import file_sha256
+from droid_jax.storage import file_sha256, remove_own
 
 if TYPE_CHECKING:
     from droid_jax.model.parameters import Space
@@ -171,7 +171,9 @@ def forget(out: Path, stage: str, results_alone: bool = False) -> None:
     """Remove the results of a stage's run, and its checkpoints unless `results_alone`."""
     begun = () if results_alone else ("checkpoints", "tensorboard", SETUP)
     for name in (LAST_FILES[stage], *RESULTS[stage], *begun):
-        if (path := out / name).is_dir():
+        if (path := out / name).is_dir() and name == "export":
+            remove_own(path)  # the user's own files may lie beside
+        elif path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)

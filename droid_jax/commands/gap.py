@@ -195,22 +195,22 @@ def run(command: GapCommand) -> None:
 
     def keep(case: Case, now: Amended, seconds: Mapping[str, float]) -> None:
         """Write the verdict, and again after each amendment, so that a stop between them loses nothing."""
-        write = write_amended if written else write_gap
+
+        def write() -> None:
+            described = {**description, "seconds": {"preparation": preparation, **seconds}}
+            (write_amended if written else write_gap)(out, case, now.verdict, now.final, described, now.states)
+            written.append(now.verdict.sentence)
+
+        description.pop("open_loop", None)  # of the model before
+        if split is not Split.WINDOWS or not written:
+            write()
         if split is Split.WINDOWS:
             values = now.verdict.base.values, now.final.model.values
             try:
                 description["open_loop"] = open_loop_errors(case, roles, *values)
             except ValueError as error:  # the verdict does not depend on it
                 warnings.warn(f"whole motions are not replayed open loop: {error}", stacklevel=2)
-        write(
-            out,
-            case,
-            now.verdict,
-            now.final,
-            {**description, "seconds": {"preparation": preparation, **seconds}},
-            now.states,
-        )
-        written.append(now.verdict.sentence)
+            write()
 
     try:
         searched(split, case, roles, out / "checkpoints", start, board, keep)

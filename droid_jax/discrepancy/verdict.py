@@ -160,7 +160,8 @@ class Verdict:
         if self.conclusion is Conclusion.UNEXPLAINED:
             hints = f" Hints, not names, since they may only imitate it: {'; '.join(map(str, self.hints))}."
             rejected = "".join(f", or {text}" for text in _narrowly_rejected(self.validation_tests))
-            return f"The model lacks something that is not in the library{rejected}.{hints if self.hints else ''}"
+            left = "; not all of the library was tried" if self.not_tried else " that is not in the library"
+            return f"The model lacks something{left}{rejected}.{hints if self.hints else ''}"
         which = "the model with the effects" if self.base.refined.converged else "the base model"
         return f"The fit of {which} did not converge; nothing can be concluded."
 

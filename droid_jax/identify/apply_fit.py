@@ -38,7 +38,7 @@ SAME = 1e-9  # relative; mj_setConst reproduces a model's derived numbers up to 
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
 _AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _NAMED = ("table", "inertias")  # parts of fitted.json whose entries name an element
-_UNIT = ("body_quat", "jnt_axis", "geom_quat")  # fields of unit vectors
+_UNIT = ("body_quat", "body_iquat", "jnt_axis", "geom_quat")  # fields of unit vectors
 # Fields from which mj_setConst derives others.
 _DERIVING = {"body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat", "dof_armature", "jnt_pos",
              "jnt_axis", "geom_pos", "geom_quat"}  # fmt: skip
@@ -50,7 +50,7 @@ _OF_ELEMENTS = ("body_", "jnt_", "dof_", "qpos", "geom_", "site_", "pair_", "act
 _SHAPED = (int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_HFIELD))  # geoms with a frame of their data
 # Fields that a compiled spec must reproduce.
 _REPRODUCED = ("body_mass", "body_inertia", "jnt_stiffness", "dof_damping", "dof_frictionloss", "dof_armature",
-               "actuator_gainprm", "actuator_biasprm")  # fmt: skip
+               "actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange")  # fmt: skip
 
 
 def load(path: str | Path) -> dict[str, Any]:
@@ -148,13 +148,29 @@ def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
         rng = np.random.default_rng([seed, sample])
         for tries in (FIRST_TRIES, TRIES - FIRST_TRIES):
             rows = mean + rng.standard_normal((tries, len(mean))) @ root.T
-            inside = np.flatnonzero(np.all((rows >= low) & (rows <= high), axis=1))
-            if len(inside):
-                out[i] = rows[inside[0]]
+            inside = np.flatnonzero(np.all((rows >= low) & (rows <= high), axis=1)).tolist()
+            first = next((k for k in inside if _possible(fit, rows[k], physical)), None)
+            if first is not None:
+                out[i] = rows[first]
                 break
         else:
             out[i] = _gibbs(rng, mean, cov, low, high)
     return np.stack([_physical(p, out[:, i], physical) for i, p in enumerate(parameters)], axis=1)
+
+
+def _possible(fit: dict[str, Any], x: np.ndarray, physical: bool) -> bool:
+    """Whether some body can have the moments of a draw, which MuJoCo's compiler wants too."""
+    if not any(row["field"] == "body_inertia" for row in fit["table"]):
+        return True
+    values = {p["name"]: float(_physical(p, x[i], physical)) for i, p in enumerate(fit["parameters"])}
+    moments: dict[Any, dict[int, float]] = {}
+    for row in fit["table"]:
+        if row["field"] == "body_inertia":
+            moments.setdefault(row["id"], {})[row["column"]] = number_of(row, values)
+    for each in moments.values():
+        if len(each) == 3 and not 0 < 2 * max(each.values()) <= sum(each.values()) * (1 + 1e-5):
+            return False
+    return True
 
 
 def _box(p: dict[str, Any], physical: bool) -> tuple[float, float]:
@@ -312,8 +328,7 @@ def _bound(model: mujoco.MjModel, geom: int) -> None:
 def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any]) -> None:
     """Write the numbers of a compiled model into the elements of its spec."""
     bodies = set()
-    if any(row["field"] in _WEIGHT for row in fit["table"]):
-        _state_derived(spec, model)
+    _state_derived(spec, model)
     for row in fit["table"]:
         number, field = _id(model, row), row["field"]
         element = _element(spec, row["element"], number)
@@ -338,6 +353,9 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
             if row["angle"] and element.type != mujoco.mjtJoint.mjJNT_SLIDE and element.compiler.degree:
                 numbers = np.degrees(numbers)
             _set(element, row["spec"], numbers)
+    if bodies and spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO  # it ignores what is stated
+        bodies |= set(np.flatnonzero(model.body_mass > 0).tolist())
     for body in bodies:
         element = _element(spec, "body", body)
         element.explicitinertial, element.mass = True, float(model.body_mass[body])
@@ -353,11 +371,14 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
 
 
 def _state_derived(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """State numbers that the compiler would derive from the masses: total mass, damping ratios."""
+    """State numbers that the compiler would derive from others: total mass, damping ratios, inherited ranges."""
     spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:
             _set(actuator, "biasprm", model.actuator_biasprm[actuator.id])
+        if actuator.inheritrange:  # from its joint, whose range the fit may have moved
+            actuator.inheritrange = 0.0
+            _set(actuator, "ctrlrange", model.actuator_ctrlrange[actuator.id])
 
 
 def _element(spec: mujoco.MjSpec, kind: str, number: int) -> Any:
@@ -408,7 +429,8 @@ class Laws:
             if law["acts"] in ("acceleration", "speed"):
                 inverse = float(sum(size * table for size, table in tables))
                 if inverse > 0:
-                    self._goals.append(_Goal(_drive(model, joint), law["acts"], 1.0 / inverse))
+                    u = _drive(model, joint)
+                    self._goals.append(_Goal(u, law["acts"], abs(float(model.actuator_gear[u, 0])) / inverse))
                 continue
             shapes = [a for a in law["axes"] if a["name"] in values]
             table = sum(size * _at(table, shapes, values) for size, table in tables)
@@ -499,7 +521,7 @@ def _drive(model: mujoco.MjModel, joint: int) -> int:
 
 
 class _Goal:
-    """The goal position that a servo follows instead of its command, with limited speed or acceleration."""
+    """The control that a servo follows instead of its command, with limited speed or acceleration."""
 
     def __init__(self, actuator: int, acts: str, limit: float) -> None:
         self.actuator, self.acts, self.limit = actuator, acts, limit

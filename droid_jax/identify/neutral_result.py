@@ -239,6 +239,9 @@ def _rows(
                 writes.setdefault(("dof_solimp", (dof, k)), [])
     for joint in friction_joints:  # `Laws` changes this number in every step
         writes.setdefault(("dof_frictionloss", (scene.dof(joint),)), [])
+    for body in {index[0] for field, index in writes if field == "body_inertia"}:  # a draw needs all three moments
+        for k in range(3):
+            writes.setdefault(("body_inertia", (body, k)), [])
     attributes = {(c.field, c.entry): (c.attribute, c.index) for c in (mjcf.changes if mjcf else ())}
     return [_row(scene, field, index, of, attributes) for (field, index), of in writes.items()]
 

@@ -189,6 +189,9 @@ class _Law:
     def of_state(self, acts: str) -> Iterator[LawTable | NoTable]:
         """Force or friction loss, for each joint on which it acts."""
         scene, nv = self.scene, self.scene.model.nv
+        if self.effect.over_time:
+            yield self.no_table("it depends on the time since the recording began")
+            return
         function = self._batched(acts)
         rng = np.random.default_rng(0)
         scale = np.concatenate([np.ones(PROBES), np.geomspace(NARROW, 1.0, PROBES)])
@@ -211,14 +214,17 @@ class _Law:
                 touched.setdefault(int(dof), set()).add((variable, row))
         for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
             of = touched.get(int(dof), set())
-            if len({row for _, row in of}) > 1 or len(of) > 2:
+            rows = {row for _, row in of}
+            if len(rows) > 1 or len(of) > 2:
                 yield self.no_table("it depends on the state of several joints")
+                return
+            if rows - {int(dof)}:  # the table has no name for it
+                yield self.no_table("it depends on the state of another joint")
                 return
         for dof in np.flatnonzero(np.abs(now).max(axis=0) > 0):
             of = touched.get(int(dof), set())
-            row = next(iter(of))[1] if of else int(dof)
-            names = [v for v in VARIABLES if (v, row) in of] or ["position"]
-            yield self._table(acts, int(dof), row, names, function)
+            names = [v for v in VARIABLES if (v, int(dof)) in of] or ["position"]
+            yield self._table(acts, int(dof), names, function)
 
     def of_servo(self) -> LawTable | NoTable:
         """The torque that is added to a servo's, over the servo's torque."""
@@ -230,11 +236,15 @@ class _Law:
         gain, bias = float(model.actuator_gainprm[u, 0]), np.asarray(model.actuator_biasprm)[u]
         servo, scene = self.effect.servo, self.scene
         assert servo is not None
+        if self.effect.over_time:
+            return self.no_table("it depends on the time since the recording began")
+        # The servo is asked for torques at positions that its range of commands may not reach.
+        unlimited = model.replace(actuator_ctrllimited=np.zeros_like(np.asarray(model.actuator_ctrllimited)))
 
         def one(given: dict[str, Any], torque: Any, q: Any, v: Any) -> Any:
             zero = jnp.zeros(scene.model.nv, jnp.float32)
             qpos = jnp.asarray(scene.model.qpos0, jnp.float32).at[scene.qpos(joint)].set(q)
-            state = State(jnp.float32(0), qpos, zero.at[scene.dof(joint)].set(v), zero, model)
+            state = State(jnp.float32(0), qpos, zero.at[scene.dof(joint)].set(v), zero, unlimited)
             feedback = bias[0] + bias[1] * gear * q + bias[2] * gear * v
             ctrl = jnp.zeros(scene.model.nu, jnp.float32).at[u].set((torque / gear - feedback) / gain)
             return gear * (gain * servo(self.theta(given), state, ctrl)[u] + feedback) - torque
@@ -255,14 +265,12 @@ class _Law:
         return self._made("servo", joint, unit, [GridAxis("torque", unit, first_nodes(-reach, reach))],
                           lambda given, x: of_torque(given, x[:, 0]))  # fmt: skip
 
-    def _table(
-        self, acts: str, dof: int, row: int, names: list[str], function: Callable[..., np.ndarray]
-    ) -> LawTable | NoTable:
+    def _table(self, acts: str, dof: int, names: list[str], function: Callable[..., np.ndarray]) -> LawTable | NoTable:
         scene, model = self.scene, self.scene.model
-        acting, of = (model.joint(int(model.dof_jntid[d])).name for d in (dof, row))
-        slides = model.jnt_type[model.dof_jntid[row]] == mujoco.mjtJoint.mjJNT_SLIDE
-        columns = {v: c for c, v, r in self._columns() if r == row}
-        axes = [GridAxis(v, UNIT[v][slides], first_nodes(*self._reach(of, v))) for v in names]
+        acting = model.joint(int(model.dof_jntid[dof])).name
+        slides = model.jnt_type[model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_SLIDE
+        columns = {v: c for c, v, r in self._columns() if r == dof}
+        axes = [GridAxis(v, UNIT[v][slides], first_nodes(*self._reach(acting, v))) for v in names]
         base = np.concatenate([model.qpos0, np.zeros(2 * model.nv)])
 
         def at(given: dict[str, np.ndarray], x: np.ndarray) -> np.ndarray:
@@ -270,7 +278,6 @@ class _Law:
             states[:, [columns[v] for v in names]] = x
             return function(given, states)[:, dof]
 
-        assert acting == of or acts == "force"
         return self._made(acts, acting, UNIT["torque"][scene.slides(acting)], axes, at)
 
     def _made(

@@ -356,10 +356,11 @@ def _absolute(
         out[tag] = {k: str((folder / v).resolve()) for k, v in dirs.items()}
     files = [a.file for kind in (spec.meshes, spec.textures, spec.hfields, spec.skins) for a in kind if a.file]
     stated = {k for changes in out.values() for k in changes}
-    if any(not os.path.isabs(file) for file in files) and not stated:
+    unstated = {"meshdir", "texturedir"} - stated if "assetdir" not in stated else set()
+    if any(not os.path.isabs(file) for file in files) and unstated:
         if not compilers:
             raise NotInPlace(f"{tree.root.file.name} has meshes or textures and no <compiler> for their folder")
-        out[compilers[0]] |= {"meshdir": str(folder), "texturedir": str(folder)}
+        out[compilers[0]] |= dict.fromkeys(sorted(unstated), str(folder))
     edited = {tag.file for tag, changes in out.items() if changes} | set(changed)
     edited |= {tag.file for tag, _ in tree.includes}
     for tag, file in tree.includes:
@@ -368,10 +369,17 @@ def _absolute(
 
 
 def _patch(tree: Tree, changed: Mapping[Path, str]) -> str:
-    """A unified diff of the user's files, to be applied in the folder of the main file."""
-    out = ""
+    """A unified diff of the user's files, to be applied in the folder that holds all of them.
+
+    That is the main file's folder, unless an included file lies outside of it.
+    """
+    places = {file: Path(os.path.normpath(file.absolute())) for file in (tree.root.file, *changed)}
+    out, folder = "", os.path.commonpath([place.parent for place in places.values()])
     for file, text in changed.items():
-        name = os.path.relpath(file, tree.root.file.parent)
+        name = places[file].relative_to(folder).as_posix()
         before, after = (t.splitlines(keepends=True) for t in (tree.texts[file].decode("utf-8"), text))
-        out += "".join(difflib.unified_diff(before, after, f"a/{name}", f"b/{name}", n=2))
+        # A tab ends a name that contains spaces.
+        names = (f"{side}/{name}" + "\t" * (" " in name) for side in "ab")
+        lines = difflib.unified_diff(before, after, *names, n=2)
+        out += "".join(line if line.endswith("\n") else f"{line}\n\\ No newline at end of file\n" for line in lines)
     return out

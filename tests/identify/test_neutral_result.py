@@ -211,7 +211,7 @@ def test_laws_name_their_variables(made: Made):
 
 
 def test_a_law_without_a_table_is_listed_and_the_others_are_written(made: Made):
-    """One that depends on two joints, and one that fails."""
+    """One that depends on two joints, one that depends on another joint, and one that fails."""
 
     def of_two(theta: Any, state: Any) -> Any:
         return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * state.qpos[0] * state.qpos[1])
@@ -220,7 +220,12 @@ def test_a_law_without_a_table_is_listed_and_the_others_are_written(made: Made):
         raise RuntimeError("no such thing")
 
     parameter = Parameter("size", "N m", 0.0, 1.0, -1.0, 1.0)
-    for force, said in ((of_two, "several joints"), (failing, "RuntimeError: no such thing")):
+
+    def of_another(theta: Any, state: Any) -> Any:
+        return jnp.zeros_like(state.qvel).at[0].set(theta["size"] * state.qpos[1])
+
+    failures = (of_two, "several joints"), (of_another, "another joint"), (failing, "RuntimeError: no such thing")
+    for force, said in failures:
         effect = Effect("own", (parameter,), force=force, locations={"elbow": ("size",)})
         (found,) = law_tables(made.scene, made.scene.mjx, [effect], {"size": 0.5}, {"size": 0.1})
         assert isinstance(found, NoTable) and said in found.why
@@ -381,9 +386,11 @@ ROD = """<mujoco><compiler angle="radian"/><option timestep="0.002"/><worldbody>
 </worldbody><actuator>{motor}<position name="turn" joint="turn" kp="20"/></actuator></mujoco>"""
 
 
-def fit_of_rod(folder: Path, entries: list[dict[str, Any]], motor: str = "", effects: Sequence[str] = ()) -> Any:
+def fit_of_rod(
+    folder: Path, entries: list[dict[str, Any]], motor: str = "", effects: Sequence[str] = (), xml: str = ROD
+) -> Any:
     """fitted.json of a rod half a deviation from its prior mean, and its scene."""
-    (folder / "rod.xml").write_text(ROD.format(motor=motor))
+    (folder / "rod.xml").write_text(xml.format(motor=motor))
     (folder / "parameters.json").write_text(json.dumps(entries))
     scene = load_scene(folder / "rod.xml", hold=True)
     chosen = library(scene, effects)
@@ -407,6 +414,37 @@ def test_friction_that_the_fit_held_is_held_where_it_is_applied(tmp_path: Path):
     spec = mujoco.MjSpec.from_file(str(tmp_path / "rod.xml"))
     apply_fit.apply(spec, fit)
     np.testing.assert_allclose(spec.compile().dof_solimp, written.dof_solimp, rtol=1e-6)
+
+
+def test_numbers_that_the_compiler_derives_are_those_of_the_fit_in_a_spec_too(tmp_path: Path):
+    """Regressions: a damping ratio, an inherited range and the inertias of `inertiafromgeom` were derived anew."""
+    entries = [
+        {"field": "dof_armature", "element": "turn", "mean": 0.02, "std": 0.01, "high": 0.5},
+        {"field": "jnt_range", "element": "turn", "column": 0, "std": 0.1, "low": -1.5, "high": -0.5},
+        {"field": "body_mass", "element": "rod", "std": 0.2, "high": 9.0},
+    ]
+    limited = ROD.replace('kp="20"', 'kp="20" dampratio="1" inheritrange="1"')
+    limited = limited.replace("frictionloss", 'range="-1 1" frictionloss')
+    for xml in (limited, limited.replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')):
+        fit, _ = fit_of_rod(tmp_path, entries, xml=xml)
+        kinds = mujoco.MjModel.from_xml_path, mujoco.MjSpec.from_file
+        model, spec = (kind(str(tmp_path / "rod.xml")) for kind in kinds)
+        apply_fit.apply(model, fit, sample=3)
+        apply_fit.apply(spec, fit, sample=3)
+        again = spec.compile()
+        for name in ("body_mass", "actuator_biasprm", "actuator_ctrlrange", "jnt_range", "dof_armature"):
+            np.testing.assert_allclose(getattr(again, name), getattr(model, name), rtol=1e-6, err_msg=name)
+
+
+def test_draws_are_inertias_that_a_body_can_have(tmp_path: Path):
+    """Regression: draws of one moment broke A + B >= C, which MuJoCo's compiler refuses."""
+    rod = ROD.replace("<joint ", '<inertial pos="0 0 .1" mass="1" diaginertia=".01 .008 .004"/><joint ', 1)
+    moment = {"field": "body_inertia", "element": "rod", "column": 0, "std": 0.004, "high": 0.1}
+    fit, _ = fit_of_rod(tmp_path, [moment], xml=rod)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "rod.xml"))
+    found = apply_fit.batch(model, fit, 40)["body_inertia"][:, -1]
+    assert np.ptp(found[:, 0]) > 0.004
+    assert np.all(2 * found.max(axis=1) <= found.sum(axis=1) * (1 + 1e-5))
 
 
 def test_a_batch_finds_full_inertias_by_their_prefix(tmp_path: Path):

@@ -138,6 +138,43 @@ def test_the_patch_changes_the_users_files(scene: Scene, tmp_path: Path):
         np.testing.assert_allclose(getattr(again, name), getattr(expected, name), rtol=1e-6, atol=2e-6, err_msg=name)
 
 
+def test_the_patch_finds_files_above_names_with_spaces_and_ends_without_a_line(tmp_path: Path):
+    """Regressions: the program `patch` could not apply them."""
+    import shutil
+    import subprocess
+
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "common").mkdir()
+    (tmp_path / "common" / "my arm.xml").write_text(ARM.replace('<geom type="mesh" mesh="wedge"/>', "").rstrip())
+    main = MAIN.replace("parts/arm.xml", "../common/my arm.xml").replace(' meshdir="shapes"', "")
+    main = main.replace('<asset><mesh name="wedge" file="wedge.obj"/></asset>', "")
+    (tmp_path / "robots" / "robot.xml").write_text(main.rstrip())
+    scene = load_scene(tmp_path / "robots" / "robot.xml")
+    space = Space((joint_damping(scene, "swing", std=1.0, high=20.0), servo_scale(scene, "swing")))
+    made = fitted_files(scene, space, space.mean + 0.7 * space.std)
+    assert made.in_place and "+++ b/common/my arm.xml" in made.patch
+    if shutil.which("patch") is None:
+        pytest.skip("there is no program `patch`")
+    subprocess.run(["patch", "-p1"], input=made.patch, text=True, cwd=tmp_path, check=True)
+    again = mujoco.MjModel.from_xml_path(str(tmp_path / "robots" / "robot.xml"))
+    expected = make_c_model(scene, space, space.mean + 0.7 * space.std)
+    np.testing.assert_allclose(again.dof_damping, expected.dof_damping, rtol=1e-6)
+
+
+@pytest.mark.parametrize("stated", ["meshdir", "texturedir"])
+def test_one_stated_folder_of_assets_leaves_the_other_where_it_was(tmp_path: Path, stated: str):
+    """Regression: only the stated one was made absolute, and the scene was written by MuJoCo."""
+    (tmp_path / "tex").mkdir()
+    folder = tmp_path / ("tex" if stated == "meshdir" else ".")
+    (folder / "wedge.obj").write_text(WEDGE)
+    main = f"""<mujoco><compiler {stated}="tex"/><asset><mesh name="wedge" file="wedge.obj"/></asset><worldbody>
+    <body><joint name="swing" damping="1"/><geom type="mesh" mesh="wedge"/></body></worldbody></mujoco>"""
+    (tmp_path / "robot.xml").write_text(main)
+    scene = load_scene(tmp_path / "robot.xml")
+    space = Space((joint_damping(scene, "swing", std=1.0, high=20.0),))
+    assert fitted_files(scene, space, space.mean + 0.5).in_place
+
+
 def test_changes_say_where_a_number_came_from(scene: Scene):
     space = Space((joint_damping(scene, "swing", std=1.0, high=20.0), servo_scale(scene, "swing")))
     made = fitted_files(scene, space, np.array([3.0, 1.1]))

@@ -81,7 +81,8 @@ def joint_backlash(scene: Scene) -> Effect | None:
 
     def servo(theta, state, ctrl):
         half = 0.5 * column(theta, BACKLASH, servos.joints)
-        error = servos.rigid_torque(state, ctrl) / servos.stiffness_in(state)
+        stiffness = servos.stiffness_in(state)
+        error = servos.rigid_torque(state, ctrl) / jnp.where(stiffness != 0.0, stiffness, 1.0)
         lead = jnp.sign(half) * jnp.clip(error, -jnp.abs(half), jnp.abs(half))
         return servos.with_lead(state, ctrl, lead)
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from droid_jax.model.scene import Scene
 
-Turned = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+Turned = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 def turned(scene: Scene, body: int) -> Turned | None:
-    """A function qpos [nq] -> axes [nv, 3] of the joints that carry a body, and its rotation [3, 3], in the world.
+    """A function (qpos [nq], qpos0 [nq]) -> axes [nv, 3] of the joints that carry a body, and its rotation [3, 3], in
+    the world.
 
     Axes of degrees of freedom that do not turn the body are zero.  None if a free or ball joint carries it.
     """
@@ -28,7 +29,7 @@ def turned(scene: Scene, body: int) -> Turned | None:
         return None
     frames = {link: jnp.asarray(_matrix(model.body_quat[link]), jnp.float32) for link in links}
 
-    def at(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def at(qpos: jax.Array, qpos0: jax.Array) -> tuple[jax.Array, jax.Array]:
         axes, rotation = jnp.zeros((model.nv, 3), jnp.float32), jnp.eye(3, dtype=jnp.float32)
         for link in links:
             rotation = rotation @ frames[link]
@@ -37,7 +38,7 @@ def turned(scene: Scene, body: int) -> Turned | None:
                     continue
                 address, axis = int(model.jnt_qposadr[joint]), np.asarray(model.jnt_axis[joint], np.float32)
                 axes = axes.at[int(model.jnt_dofadr[joint])].set(rotation @ axis)
-                rotation = rotation @ _about(axis, qpos[address] - model.qpos0[address])
+                rotation = rotation @ _about(axis, qpos[address] - qpos0[address])
         return axes, rotation
 
     return at

@@ -135,7 +135,8 @@ def _weight_of_moment(
     gravity = jnp.asarray(scene.model.opt.gravity, jnp.float32)
 
     def force(theta: Theta, state: State) -> jax.Array:
-        axes, rotation = links(state.qpos)
+        # The sample's own reference position: an encoder that is off reads another angle than the joint has.
+        axes, rotation = links(state.qpos, scene.model.qpos0 if state.model is None else state.model.qpos0)
         return axes @ jnp.cross(rotation @ moment(theta), gravity)
 
     return force

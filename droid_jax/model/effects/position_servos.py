@@ -40,7 +40,7 @@ class PositionServos:
         They are relative to the servo's own, since the data constrain both together.
         """
         each = zip(self.joints, self.stiffness.tolist(), strict=True)
-        return {joint: (max(1e-4, 0.05 / k), max(1e-3, 0.3 / k)) for joint, k in each}
+        return {joint: (min(max(1e-4, 0.05 / k), 0.1 / k), min(max(1e-3, 0.3 / k), 1.0 / k)) for joint, k in each}
 
     def where(self, chosen: np.ndarray) -> PositionServos | None:
         """Those of `chosen`, [J] bool; None if it chooses none."""
@@ -82,9 +82,10 @@ class PositionServos:
         return low, jnp.minimum(high, jnp.where(limited, ranges[:, 1], highest))
 
     def with_torque(self, state: State, ctrl: jax.Array, torque: jax.Array) -> jax.Array:
-        """[U] the command with which the servos give torque [J] N m more."""
+        """[U] the command with which the servos give torque [J] N m more; unchanged where the gain is zero."""
         gain, _ = self.law(state)
-        return ctrl.at[self.actuators].add(torque / (self.gear * gain))
+        scale = self.gear * gain
+        return ctrl.at[self.actuators].add(jnp.where(scale != 0.0, torque / jnp.where(scale != 0.0, scale, 1.0), 0.0))
 
     def with_lead(self, state: State, ctrl: jax.Array, lead: jax.Array) -> jax.Array:
         """[U] the command with the same effect as motors that are ahead of their links by lead [J] rad."""

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from droid_jax.model.actuators import has_feedback
 from droid_jax.model.effect_interface import Effect, Theta, column
@@ -28,7 +29,7 @@ def profile_acceleration(scene: Scene) -> Effect | None:
 
     def profile(theta: Theta, command: jax.Array, timestep: float) -> jax.Array:
         limit = column(theta, ACCELERATION, scene.command_names)
-        most = 1.0 / jnp.where(limit > 0.0, limit, 1.0)
+        most = _gears(scene) / jnp.where(limit > 0.0, limit, 1.0)
 
         def follow(state, goal):
             at, speed = state
@@ -62,7 +63,7 @@ def profile_speed(scene: Scene) -> Effect | None:
 
     def profile(theta: Theta, command: jax.Array, timestep: float) -> jax.Array:
         limit = column(theta, SPEED, scene.command_names)
-        most = timestep / jnp.where(limit > 0.0, limit, 1.0)
+        most = _gears(scene) * timestep / jnp.where(limit > 0.0, limit, 1.0)
 
         def follow(state, goal):
             at, speed = state
@@ -89,6 +90,11 @@ def profile_speed(scene: Scene) -> Effect | None:
 def _followed(follow, command: jax.Array) -> jax.Array:
     """[T, U] positions of a reference that starts at rest at the first command [T, U]."""
     return jax.lax.scan(follow, (command[0], jnp.zeros_like(command[0])), command)[1]
+
+
+def _gears(scene: Scene) -> np.ndarray:
+    """[U] controls for a position of the joint, since a command is a control."""
+    return np.where(scene.of_joint, np.abs(scene.model.actuator_gear[:, 0]), 1.0).astype(np.float32)
 
 
 def _servos(scene: Scene) -> Sequence[str]:

@@ -49,6 +49,45 @@ def test_backlash_has_no_torque_inside_and_compliance_is_linear(scale: float):
     np.testing.assert_allclose(torque(soft), 0.002 / (1.0 / stiffness + 1e-3), rtol=1e-4)
 
 
+SERVO = """<mujoco><worldbody><body><joint name="{joint}" type="{kind}" axis="1 0 0" damping="9"/><geom size=".1"/>
+  </body></worldbody><actuator><position name="{joint}" joint="{joint}" kp="{kp}" gear="{gear}"/></actuator></mujoco>"""
+
+
+def servo_of(**numbers: object) -> Scene:
+    xml = SERVO.format(**{"joint": "j", "kind": "hinge", "kp": 20, "gear": 1, **numbers})
+    return compile_scene(mujoco.MjSpec.from_string(xml), "servo", joints=["j"])
+
+
+def test_a_servo_without_gain_has_no_gear_that_yields():
+    """Regression: a log of a robot in damping mode, kp = 0, had no finite replay."""
+    scene = servo_of()
+    still = jnp.zeros(1, jnp.float32)
+    physics = scene.mjx
+    off = physics.replace(actuator_gainprm=0 * physics.actuator_gainprm, actuator_biasprm=0 * physics.actuator_biasprm)
+    state = State(jnp.float32(0.0), still, still, still, off)
+    for effect in library(scene, ["joint_backlash", "joint_compliance"]):
+        assert effect.servo is not None
+        theta = {f"{effect.name}[j]": jnp.float32(1e-3)}
+        np.testing.assert_allclose(effect.servo(theta, state, still + 0.3), [0.3], rtol=1e-6)
+
+
+def test_a_stiff_servo_has_a_gear_that_is_as_stiff():
+    """Regression: its least compliance was twice the servo's own, at which nothing could be named."""
+    (effect,) = library(servo_of(kind="slide", kp=1e5), ["joint_compliance"])
+    assert effect.minimum_size < 0.05 / 1e5 and effect.parameters[0].high == pytest.approx(1 / 1e5)
+
+
+@pytest.mark.parametrize("name", ["profile_speed", "profile_acceleration"])
+def test_a_profile_is_the_joints_behind_a_gear(name: str):
+    """Regression: the limit was one of the control, which is the joint's position times the gear."""
+    (effect, geared) = (library(servo_of(gear=gear), [name])[0] for gear in (1, 50))
+    assert effect.profile is not None and geared.profile is not None
+    command, theta = jnp.linspace(0.0, 1.0, 200)[:, None] ** 2, {f"{name}[j]": jnp.float32(0.9)}
+    expected = effect.profile(theta, command, 0.002)
+    assert float(jnp.max(jnp.abs(expected - command))) > 0.1
+    np.testing.assert_allclose(geared.profile(theta, 50 * command, 0.002) / 50, expected, atol=1e-5)
+
+
 def test_the_recorded_position_of_an_elastic_joint_is_the_motors():
     """The servo's encoder is on the motor."""
     scene = mechanism()
@@ -98,7 +137,7 @@ def test_axes_and_rotation_are_mujocos(scene, body: str):
     for _ in range(5):
         data.qpos[:] = rng.uniform(-1, 1, model.nq)
         mujoco.mj_kinematics(model, data)
-        axes, rotation = links(data.qpos.astype(np.float32))
+        axes, rotation = links(data.qpos.astype(np.float32), model.qpos0)
         expected = np.zeros((model.nv, 3))
         expected[model.jnt_dofadr[turning]] = data.xaxis[turning]
         np.testing.assert_allclose(axes, expected, atol=2e-6)

@@ -37,6 +37,7 @@ OF_GRIPS = {"contact_compliance", *OF_THEIR_OWN}  # neither is in the small scen
 def own_list(monkeypatch: pytest.MonkeyPatch) -> None:
     """Registrations of a test are removed after it."""
     registered()
+    registry.registered()  # those of the library, which are registered once in a process
     monkeypatch.setattr(registry, "_MAKERS", copy.copy(registry._MAKERS))
 
 
