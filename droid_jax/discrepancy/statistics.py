@@ -395,7 +395,8 @@ class Blocks:
         _, values, rows = np.linalg.svd(base * prior, full_matrices=False)
         kept = 1.0 / (1.0 + values**2)
         factor = prior[:, None] * rows.T * np.sqrt(kept + kept**2)
-        shares = np.stack([(sensitivities * inside) @ base @ factor for inside in self._inside])  # [B, K, D]
+        columns, numbers = base @ factor, (np.flatnonzero(inside) for inside in self._inside)
+        shares = np.stack([sensitivities[:, some] @ columns[some] for some in numbers])  # [B, K, D]
         size = np.einsum("km,km->k", sensitivities, sensitivities)
         chunks = np.split(flips, np.arange(CHUNK, len(flips), CHUNK))
         absorbed = np.concatenate([np.sum(np.tensordot(some, shares, 1) ** 2, axis=-1) for some in chunks])
