@@ -29,6 +29,7 @@ from droid_jax.report.policy_folder import Trained, Training, Transfer
 from droid_jax.report.render import NoOpenGL
 from droid_jax.report.stages import extended_of, fingerprint
 from droid_jax.run import main
+from droid_jax.storage import write_own
 
 pytestmark = pytest.mark.usefixtures("tuned")
 
@@ -122,7 +123,8 @@ def test_the_setup_of_every_command_can_be_written():
 
 
 def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
-    old = ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "export/policy.onnx", "training.json")
+    old = ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "training.json")
+    write_own(tmp_path / "export", {"policy.onnx": b"old"})
     for name in (*old, "checkpoints/0/x", "mine.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("old")
@@ -130,6 +132,13 @@ def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
     assert {p.name for p in tmp_path.iterdir()} == {"setup.json", "checkpoints", "mine.txt"}
     begin(tmp_path, {"seed": 1}, again=True, stage="train")
     assert {p.name for p in tmp_path.iterdir()} == {"setup.json", "mine.txt"}
+    write_own(tmp_path / "export", {"control.py": b"old", "policy.onnx": b"old"})
+    (tmp_path / "export" / "control.py").write_text("changed")
+    begin(tmp_path, {"seed": 1}, again=True, stage="train")
+    assert {p.name for p in (tmp_path / "export").iterdir()} == {
+        "control.py",
+        ".written.json",
+    }  # which the user changed
 
 
 def test_without_a_fit_there_is_the_prior(scene):
