@@ -123,15 +123,21 @@ def write_own(folder: Path, files: Mapping[str, bytes]) -> None:
         write_bytes(folder / name, content)
 
 
-def remove_own(folder: Path) -> None:
-    """Remove the files that `write_own` wrote in a folder and that are unchanged, and the folder if nothing is left."""
-    for name, known in _written(folder).items():
+def remove_own(folder: Path) -> bool:
+    """Remove the unchanged files of `write_own` from a folder that it wrote in, and the folder if nothing is left.
+
+    Returns False, and removes nothing, if it has written nothing there.
+    """
+    if not (written := _written(folder)):
+        return False
+    for name, known in written.items():
         path = folder / name
         if path.is_file() and file_sha256(path) in known:
             path.unlink()
     if {path.name for path in folder.iterdir()} <= {WRITTEN}:
         (folder / WRITTEN).unlink(missing_ok=True)
         folder.rmdir()
+    return True
 
 
 def _written(folder: Path) -> dict[str, list[str]]:

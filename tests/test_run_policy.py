@@ -123,8 +123,7 @@ def test_the_setup_of_every_command_can_be_written():
 
 
 def test_a_new_training_forgets_the_old_policy(tmp_path: Path):
-    old = ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "training.json")
-    write_own(tmp_path / "export", {"policy.onnx": b"old"})
+    old = ("policy.npz", "transfer.json", "extended.json", "films/good.webp", "export/policy.onnx", "training.json")
     for name in (*old, "checkpoints/0/x", "mine.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("old")

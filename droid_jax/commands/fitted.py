@@ -86,10 +86,10 @@ def _identified(folder: Path, asked: dict[str, Any], given: Path | None) -> Fitt
     known = {p.name: p for p in fit.parameters}
     if absent := [name for name in space.names if name not in known]:
         raise ValueError(f"{folder / FIT} lacks {', '.join(absent)} of {FULL_GAUSSIAN}: they are of two runs")
-    rubbed = _rubbed(space.parameters)
-    scene = _scene_of(asked, given, rubbed)
-    if scene.sha256 != asked.get("scene_sha256") and (every := _rubbed_in_file(asked)) != rubbed:
-        scene = _scene_of(asked, given, every)  # the scene was compiled for nuisances too, which were not fitted
+    scene, known_scene = _scene_of(asked, given, _rubbed(space.parameters)), asked.get("scene_sha256")
+    if scene.sha256 != known_scene:  # it may have been compiled for nuisances too, which were not fitted
+        other = _scene_of(asked, given, _rubbed_in_file(asked))
+        scene = other if other.sha256 == known_scene else scene
     scene, effects = effects_in(command, scene)
     _check_same(folder, asked, scene, given)
     return Fitted(

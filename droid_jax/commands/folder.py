@@ -171,10 +171,9 @@ def forget(out: Path, stage: str, results_alone: bool = False) -> None:
     """Remove the results of a stage's run, and its checkpoints unless `results_alone`."""
     begun = () if results_alone else ("checkpoints", "tensorboard", SETUP)
     for name in (LAST_FILES[stage], *RESULTS[stage], *begun):
-        if (path := out / name).is_dir() and name == "export":
-            remove_own(path)  # the user's own files may lie beside
-        elif path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
+        if (path := out / name).is_dir():
+            if not remove_own(path):
+                shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
 

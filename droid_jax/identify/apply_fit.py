@@ -328,6 +328,8 @@ def _bound(model: mujoco.MjModel, geom: int) -> None:
 def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any]) -> None:
     """Write the numbers of a compiled model into the elements of its spec."""
     bodies = set()
+    if any(row["field"] in _WEIGHT for row in fit["table"]):  # the compiler would bound or scale the masses again
+        spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
     _state_derived(spec, model)
     for row in fit["table"]:
         number, field = _id(model, row), row["field"]
@@ -371,8 +373,7 @@ def _write_spec(spec: mujoco.MjSpec, model: mujoco.MjModel, fit: dict[str, Any])
 
 
 def _state_derived(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """State numbers that the compiler would derive from others: total mass, damping ratios, inherited ranges."""
-    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.settotalmass = 0.0, 0.0, -1.0
+    """State numbers of actuators that the compiler would derive from others: damping ratios, inherited ranges."""
     for actuator in spec.actuators:
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE and actuator.biasprm[2] > 0:
             _set(actuator, "biasprm", model.actuator_biasprm[actuator.id])

@@ -417,7 +417,7 @@ def test_friction_that_the_fit_held_is_held_where_it_is_applied(tmp_path: Path):
 
 
 def test_numbers_that_the_compiler_derives_are_those_of_the_fit_in_a_spec_too(tmp_path: Path):
-    """Regressions: a damping ratio, an inherited range and the inertias of `inertiafromgeom` were derived anew."""
+    """Regressions: a damping ratio, an inherited range and the inertias of `inertiafromgeom` were computed again."""
     entries = [
         {"field": "dof_armature", "element": "turn", "mean": 0.02, "std": 0.01, "high": 0.5},
         {"field": "jnt_range", "element": "turn", "column": 0, "std": 0.1, "low": -1.5, "high": -0.5},
@@ -425,8 +425,10 @@ def test_numbers_that_the_compiler_derives_are_those_of_the_fit_in_a_spec_too(tm
     ]
     limited = ROD.replace('kp="20"', 'kp="20" dampratio="1" inheritrange="1"')
     limited = limited.replace("frictionloss", 'range="-1 1" frictionloss')
-    for xml in (limited, limited.replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')):
-        fit, _ = fit_of_rod(tmp_path, entries, xml=xml)
+    of_geoms = limited.replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')
+    bounded = limited.replace('angle="radian"', 'angle="radian" boundmass="0.9"')  # the rod weighs less
+    for xml, asked in ((limited, entries), (of_geoms, entries), (bounded, entries[:2])):
+        fit, _ = fit_of_rod(tmp_path, asked, xml=xml)
         kinds = mujoco.MjModel.from_xml_path, mujoco.MjSpec.from_file
         model, spec = (kind(str(tmp_path / "rod.xml")) for kind in kinds)
         apply_fit.apply(model, fit, sample=3)
