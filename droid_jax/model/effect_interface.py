@@ -97,12 +97,11 @@ class Gear:
 
     Attributes:
         step: (theta, State, servo's input [U]) -> GearStep.
-        start: (theta, State at rest, servo's input [U]) -> `State.motors` of motors that are at rest, and [nv] rad by
-            which their encoders read more than the positions of their links.
+        start: (theta, State of `Effect.twist`, servo's input [U]) -> `State.motors` of motors at rest on their links.
     """
 
     step: Callable[[Theta, State, jax.Array], GearStep]
-    start: Callable[[Theta, State, jax.Array], tuple[jax.Array, jax.Array]]
+    start: Callable[[Theta, State, jax.Array], jax.Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +120,10 @@ class Effect:
         servo: (theta, State, ctrl [U]) -> [U], the servo's input in place of the command.
         limits: (theta, State) -> [U, 2] N m (N), lowest and highest force of each actuator in the step; infinite: none.
         gear: the gears between motors and links, in place of rigid ones.
+        twist: (theta, State where a replay begins, servo's input [U]) -> [nv] rad (m) by which encoders are ahead of
+            their links there.  The State has the encoders' readings for positions, and the input lacks the `servo` laws
+            of effects with a twist, since a servo at the reading needs no correction for it.  The links begin that far
+            behind the recorded positions.
         force: (theta, State) -> [nv] generalised force, added to qfrc_applied.
         frictionloss: (theta, State, base [nv]) -> [nv] N m, friction loss of the step.
         observe: (theta, Rollout) -> Rollout, the sensor model.
@@ -150,6 +153,7 @@ class Effect:
     servo: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     limits: Callable[[Theta, State], jax.Array] | None = None
     gear: Gear | None = None
+    twist: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     force: Callable[[Theta, State], jax.Array] | None = None
     frictionloss: Callable[[Theta, State, jax.Array], jax.Array] | None = None
     observe: Callable[[Theta, Rollout], Rollout] | None = None
@@ -167,7 +171,7 @@ class Effect:
 
 
 # Fields with functions: what acts on commands and servos, what moves the robot, and all of them.
-STEERING = ("profile", "command", "servo", "limits", "gear")
+STEERING = ("profile", "command", "servo", "limits", "gear", "twist")
 MOVING = (*STEERING, "force", "frictionloss")
 LAWS = (*MOVING, "observe", "native")
 

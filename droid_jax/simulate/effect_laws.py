@@ -110,6 +110,29 @@ def gear_of(effects: Sequence[Effect]) -> Gear | None:
     return next(iter(named.values()), None)
 
 
+def held_gears(
+    command: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]
+) -> tuple[jax.Array, jax.Array] | None:
+    """The gears where a replay begins, held by the servos' torques; None if all are rigid.
+
+    Args:
+        command: [U] to the servos.
+        theta: parameters of the effects.
+        state: with the encoders' readings for positions.
+        effects: in the model.
+
+    Returns:
+        `State.motors`, and [nv] rad (m) by which encoders are ahead of their links (`Effect.twist`).
+    """
+    gear, twists = gear_of(effects), [effect.twist for effect in effects if effect.twist is not None]
+    if gear is None and not twists:
+        return None
+    ctrl = servo_input(command, theta, state, [effect for effect in effects if effect.twist is None])
+    state = replace(state, model=apply_limits(state.model, theta, state, effects))
+    motors = state.motors if gear is None else gear.start(theta, state, ctrl)
+    return motors, sum((twist(theta, state, ctrl) for twist in twists), jnp.zeros_like(state.qvel))
+
+
 def profiled(table: jax.Array, timestep: float, theta: Theta, effects: Sequence[Effect]) -> jax.Array:
     """[T, U] the command after the servos' profiles (`Effect.profile`)."""
     for effect in effects:

@@ -1,8 +1,9 @@
 """Elastic joints, and joints with backlash.
 
 The servo measures the motor's position, the dynamics move the link.  In an elastic joint with torque tau the motor is
-at q + tau c, which its encoder reads and a recording contains.  In a joint with backlash the motor turns freely by half
-of it to either side of the link, whose position is recorded.  Both are quasi-static: vibrations are not simulated.
+at q + tau c, which its encoder reads and a recording contains.  So a motion that begins under a load begins with the
+link behind the recorded position.  In a joint with backlash the motor turns freely by half of it to either side of the
+link, whose position is recorded.  Both are quasi-static: vibrations are not simulated.
 
 The torque is solved for with the servo's law, whose gains and damping may be fitted.  Using the torque of the previous
 step would be simpler, but with a stiff servo this is a loop with a gain above one, which chatters.
@@ -41,15 +42,19 @@ def joint_compliance(scene: Scene) -> Effect | None:
         torque = servos.rigid_torque(state, ctrl) / yielding
         return servos.with_lead(state, ctrl, compliance * torque)
 
+    def twist(theta, state, ctrl):
+        ahead = column(theta, COMPLIANCE, servos.joints) * servos.held_torque(state, ctrl)
+        return jnp.zeros_like(state.qvel).at[servos.dofs].set(ahead)
+
     columns = np.array([scene.joints.index(j) for j in servos.joints], dtype=int)
 
     def observe(theta, rollout):
-        twist = column(theta, COMPLIANCE, servos.joints) * rollout.torque[:, columns]
+        ahead = column(theta, COMPLIANCE, servos.joints) * rollout.torque[:, columns]
         step = (rollout.time[-1] - rollout.time[0]) / (len(rollout.time) - 1)
         return replace(
             rollout,
-            position=rollout.position.at[:, columns].add(twist),
-            velocity=rollout.velocity.at[:, columns].add(jnp.gradient(twist, axis=0) / step),
+            position=rollout.position.at[:, columns].add(ahead),
+            velocity=rollout.velocity.at[:, columns].add(jnp.gradient(ahead, axis=0) / step),
         )
 
     sizes = servos.compliances
@@ -63,6 +68,7 @@ def joint_compliance(scene: Scene) -> Effect | None:
         COMPLIANCE,
         tuple(parameter(j, float(k)) for j, k in zip(servos.joints, servos.stiffness, strict=True)),
         servo=servo,
+        twist=twist,
         observe=observe,
         description="an elastic gear between motor and link",
         signature="tracking error in proportion to load",

@@ -81,6 +81,10 @@ class PositionServos:
         low = jnp.maximum(low, jnp.where(limited, ranges[:, 0], lowest))
         return low, jnp.minimum(high, jnp.where(limited, ranges[:, 1], highest))
 
+    def held_torque(self, state: State, ctrl: jax.Array) -> jax.Array:
+        """[J] N m, `rigid_torque` within the servos' limits."""
+        return jnp.clip(self.rigid_torque(state, ctrl), *self.limits_in(state))
+
     def with_torque(self, state: State, ctrl: jax.Array, torque: jax.Array) -> jax.Array:
         """[U] the command with which the servos give torque [J] N m more; unchanged where the gain is zero."""
         gain, _ = self.law(state)

@@ -50,6 +50,7 @@ def two_mass_resonance(scene: Scene) -> Effect | None:
         RESONANCE,
         (*of_joints, a.shape(DAMPING, "-", DAMPING_RATIOS, 0.0, 1.0)),
         gear=_gear(scene),
+        twist=functools.partial(_twist, servos),
         description="an elastic gear on which the motor and the link vibrate against each other",
         signature="vibration of that joint after fast changes, and a tracking error in proportion to load",
         confused_with=("joint_compliance", "servo_gain", "profile_acceleration"),
@@ -100,20 +101,32 @@ def _gear(scene: Scene) -> Gear:
     def step(theta: Theta, state: State, ctrl: jax.Array) -> GearStep:
         return _step(servos, theta, state, ctrl)
 
-    def start(theta: Theta, state: State, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
-        compliance, half, _ = _of(servos, theta)
-        # qpos is what was recorded: the link's position and the twist of the gear.
-        stiffness, torque = servos.stiffness_in(state), servos.rigid_torque(state, ctrl)
-        free = torque / stiffness  # the lead at which the servo is at its goal
-        held = jnp.clip(torque - stiffness * jnp.sign(torque) * half, *servos.limits_in(state))
-        elastic = compliance * held
-        inside = jnp.abs(free) < half
-        elastic = jnp.where(inside, 0.0, elastic)
-        lead = jnp.where(inside, free, jnp.sign(torque) * half + elastic)
-        none = jnp.zeros((3, len(state.qvel)), jnp.float32)
-        return none.at[0, servos.dofs].set(lead), none[0].at[servos.dofs].set(elastic)
+    def start(theta: Theta, state: State, ctrl: jax.Array) -> jax.Array:
+        lead, _ = _held(servos, theta, state, ctrl)
+        return jnp.zeros((3, len(state.qvel)), jnp.float32).at[0, servos.dofs].set(lead)
 
     return Gear(step, start)
+
+
+def _twist(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -> jax.Array:
+    """[nv] rad, the elastic part of the lead at the start, which the encoder reads and the link does not have."""
+    _, elastic = _held(servos, theta, state, ctrl)
+    return jnp.zeros_like(state.qvel).at[servos.dofs].set(elastic)
+
+
+def _held(servos: PositionServos, theta: Theta, state: State, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """[J] rad, the lead of motors that stand still, and its elastic part.
+
+    The state's positions are what was recorded: the link's position and the twist of the gear.
+    """
+    compliance, half, _ = _of(servos, theta)
+    stiffness, torque = servos.stiffness_in(state), servos.rigid_torque(state, ctrl)
+    free = torque / stiffness  # the lead at which the servo is at its goal
+    held = jnp.clip(torque - stiffness * jnp.sign(torque) * half, *servos.limits_in(state))
+    elastic = compliance * held
+    inside = jnp.abs(free) < half
+    elastic = jnp.where(inside, 0.0, elastic)
+    return jnp.where(inside, free, jnp.sign(torque) * half + elastic), elastic
 
 
 def _of(servos: PositionServos, theta: Theta) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -51,6 +51,7 @@ class Oracle:
     loss:  friction loss on top of theirs, the sum at least zero.
     late:  s, of the command.  sent: (values, time [T], look, actuator by joint) -> command [T, U] of look(time).
     lead: rad by which motors are ahead of their links.
+    twist: (values, rad by which commands lead encoders) -> rad by which these lead their links, where a motion begins.
     read:  (values, time [T], torque [T,J]) -> [T,J], what the sensor makes of it.
     joints: those to compare.
     """
@@ -63,6 +64,7 @@ class Oracle:
     late: Callable[[Values], float] | None = None
     sent: Callable[[Values, np.ndarray, Look, Mapping[str, int]], np.ndarray] | None = None
     lead: Callable[[Values, Now], ByJoint] | None = None
+    twist: Callable[[Values, ByJoint], ByJoint] | None = None
     read: Callable[[Values, np.ndarray, np.ndarray], np.ndarray] | None = None
     joints: tuple[str, ...] = JOINTS
 
@@ -303,6 +305,7 @@ ORACLES = {
     "joint_compliance": Oracle(  # two springs in series
         each(*ARM, joint_compliance=(3e-4, 4e-4)),
         edit=lambda spec, v: other_gains(spec, lambda kp, j: 1 / (1 + kp * v[f"joint_compliance[{j}]"])),
+        twist=lambda v, ahead: {j: v[f"joint_compliance[{j}]"] * STIFFNESS[j] * ahead[j] for j in ARM},
     ),
     "joint_coulomb": Oracle(
         each(*ARM, joint_coulomb=(0.5, 0.2)), edit=more_frictionloss, loss=at_arm(lambda v, j, now: v["joint_coulomb"])

@@ -159,6 +159,8 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
             if effect.servo:
                 ctrl = jnp.cos(jnp.arange(scene.model.nu, dtype=jnp.float32))
                 np.testing.assert_array_equal(effect.servo(theta, state, ctrl), ctrl)
+            if effect.twist:
+                np.testing.assert_array_equal(effect.twist(theta, state, 1.0 + 0.0 * state.qvel), 0.0 * state.qvel)
             if effect.profile:
                 given = jnp.sin(jnp.arange(3.0 * scene.model.nu)).reshape(3, -1)
                 np.testing.assert_array_equal(effect.profile(theta, given, 0.002), given)

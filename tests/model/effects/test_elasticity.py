@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -11,17 +14,17 @@ from effect_bench import ARM, door, mechanism
 from droid_jax.discrepancy.candidates import machine_scale
 from droid_jax.discrepancy.config import SelectionConfig
 from droid_jax.door.scene import door_scene
-from droid_jax.model.effect_interface import Rollout, State
+from droid_jax.model.effect_interface import Effect, Rollout, State
 from droid_jax.model.effects.effect_scaling import scale_of, usual_torques
 from droid_jax.model.effects.kinematics import turned
 from droid_jax.model.effects.registry import library
-from droid_jax.model.fields import servo_scale
+from droid_jax.model.fields import servo_scale, time_offset
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.simulate.compiled import compiled_replay
-from droid_jax.simulate.replay import Drive
+from droid_jax.simulate.compiled import compiled_replay, window_program
+from droid_jax.simulate.replay import Drive, servo_motion, traced_part
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.4])
@@ -105,6 +108,112 @@ def test_the_recorded_position_of_an_elastic_joint_is_the_motors():
     np.testing.assert_allclose(seen.velocity[1:-1, column], slope[1:-1], atol=1e-5 * joints)
     others = np.delete(np.arange(joints), column)
     assert not np.any(seen.position[:, others]) and np.array_equal(seen.torque, torque)
+
+
+# ----- a motion that begins under a load
+
+KP, MASS, REACH = 60.0, 0.8, 0.25  # N m/rad, kg, m
+HELD = 0.3  # rad, of the link, below the horizontal
+WEIGHT = MASS * 9.81 * REACH * np.cos(HELD)  # N m
+COMPLIANCE = 2e-3  # rad/(N m)
+PERIOD = 0.002  # s
+
+
+def weighted(limit: float = 1e3) -> Scene:
+    """A level hinge with a servo and a weight, which pulls to positive angles."""
+    return compile_scene(
+        mujoco.MjSpec.from_string(
+            f"""<mujoco><option timestep="{PERIOD}" integrator="implicitfast"/><worldbody><body>
+            <joint name="j" axis="0 1 0" armature="0.02" damping="0.4"/><geom size="0.02" pos="{REACH} 0 0"
+            mass="{MASS}" contype="0" conaffinity="0"/></body></worldbody><actuator><position name="j" joint="j"
+            kp="{KP}" kv="0.8" forcerange="{-limit} {limit}"/></actuator></mujoco>"""
+        ),
+        "weight",
+        joints=("j",),
+    )
+
+
+def compliant(scene: Scene) -> tuple[tuple[Effect, ...], Space]:
+    effects = library(scene, ["joint_compliance"])
+    return effects, Space(tuple(p for e in effects for p in e.parameters))
+
+
+def holding(steps: int, compliance: float = COMPLIANCE) -> Drive:
+    """The weight at rest: the servo's torque holds it, and the recorded position is the motor's."""
+    recorded = HELD - compliance * WEIGHT
+    command = np.full((steps, 1), recorded - WEIGHT / KP)
+    return Drive(command, np.array([recorded]), PERIOD, TorqueConvention(TorqueSide.MOTOR, gravity=True))
+
+
+def test_a_weight_on_a_compliant_joint_begins_below_its_encoder_and_rests():
+    """Closed form: the link is lower than the recorded position by torque times compliance."""
+    scene, drive = weighted(), holding(300)
+    effects, space = compliant(scene)
+    rows = np.tile(space.values({"joint_compliance[j]": COMPLIANCE}), (2, 1))
+    recorded = compiled_replay("mjx", scene, space, drive, effects)(rows)
+    position, torque = (np.asarray(trace)[0, :, 0] for trace in (recorded.position, recorded.torque))
+    assert position[0] == pytest.approx(drive.qpos0[0], abs=3e-7)
+    np.testing.assert_allclose(position, drive.qpos0[0], atol=2e-6)
+    np.testing.assert_allclose(torque, -WEIGHT, rtol=1e-4)
+
+    motion, inputs = servo_motion(scene, drive, effects), traced_part(scene, drive)
+    link = jax.jit(lambda values: motion(make_physics(scene, space, values), *inputs, 300).position[:, 0])
+    of_link = np.asarray(link(jnp.asarray(rows[0], jnp.float32)))
+    np.testing.assert_allclose(of_link, HELD, atol=2e-6)
+    assert of_link[0] - position[0] == pytest.approx(COMPLIANCE * WEIGHT, rel=1e-4)
+    # The start has the derivative of the closed form, the weight's torque, at neutral too.
+    for at in (0.0, COMPLIANCE):
+        slope = np.asarray(jax.jacfwd(link)(jnp.array([at], jnp.float32)))[:, 0]
+        assert np.isfinite(slope).all()
+        assert slope[0] == pytest.approx(WEIGHT, rel=1e-4)
+
+
+def test_a_servo_at_its_limit_begins_with_the_twist_of_that_torque():
+    scene, drive = weighted(limit=1.0), holding(5)
+    effects, space = compliant(scene)
+    rows = np.tile(space.values({"joint_compliance[j]": COMPLIANCE}), (2, 1))
+    found = compiled_replay("mjx", scene, space, drive, effects)(rows)
+    assert float(found.torque[0, 0, 0]) == pytest.approx(-1.0)
+    assert float(found.position[0, 0, 0]) == pytest.approx(drive.qpos0[0], abs=3e-7)
+
+
+def test_a_rigid_joint_under_load_begins_where_it_did():
+    """At neutral a replay is that without the effect."""
+    scene, drive = weighted(), holding(200, compliance=0.0)
+    drive = replace(drive, command=drive.command + 0.1 * np.sin(20.0 * drive.time)[:, None])
+    effects, space = compliant(scene)
+    neutral = compiled_replay("mjx", scene, space, drive, effects)(np.tile(space.mean, (2, 1)))
+    without = compiled_replay("mjx", scene, Space((time_offset(),)), drive, ())(np.zeros((2, 1)))
+    np.testing.assert_array_equal(neutral.position[:, 0], without.position[:, 0])
+    np.testing.assert_allclose(neutral.position, without.position, atol=1e-6)
+    np.testing.assert_allclose(neutral.torque, without.torque, atol=1e-4)
+
+
+@pytest.mark.parametrize("begin", [0, 240, 300])
+def test_a_window_of_a_compliant_joint_begins_where_the_motion_is(begin: int):
+    """From recorded positions and speeds, at rest and in motion."""
+    scene, steps, still = weighted(), 200, 150
+    effects, space = compliant(scene)
+    whole = holding(600)
+    goal = 0.3 * np.sin(5.0 * PERIOD * np.maximum(np.arange(600) - still, 0))
+    whole = replace(whole, command=whole.command + goal[:, None])
+    rows = np.tile(space.values({"joint_compliance[j]": COMPLIANCE}), (2, 1))
+    of_motion = compiled_replay("mjx", scene, space, whole, effects)(rows)
+    position, velocity = (np.asarray(trace)[0, :, 0] for trace in (of_motion.position, of_motion.velocity))
+    early = 0.5 * (velocity[begin - 1] + velocity[begin]) if begin else 0.0  # half a step before the position
+    earlier = 10
+    table = np.r_[
+        np.repeat(whole.command[:1], max(earlier - begin, 0), axis=0), whole.command[max(begin - earlier, 0) :]
+    ]
+    window = window_program(scene, space, whole, effects, earlier, steps)
+    start, speed, gains = np.full((2, 1), position[begin]), np.full((2, 1), early), np.ones((2, 1, 2))
+    found = window(
+        rows, np.tile(table[None, : earlier + steps], (2, 1, 1)), start, gains, speed, np.full(2, begin * PERIOD)
+    )
+    replayed = np.asarray(found.position)[0, :, 0]
+    twist = COMPLIANCE * np.abs(np.asarray(of_motion.torque)[0, begin, 0])
+    off = np.abs(replayed - position[begin : begin + steps]).max()
+    assert off < (0.1 if begin else 1e-3) * twist
 
 
 def test_the_prior_of_compliance_is_relative_to_the_servo():

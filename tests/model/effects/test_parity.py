@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
-from effect_bench import JOINTS, MECHANISM, Bench, mechanism_bench
-from effect_oracles import ORACLES, Now, Oracle
+from effect_bench import JOINTS, MECHANISM, Bench, bare, make_bench, mechanism_bench
+from effect_oracles import ORACLES, STIFFNESS, Now, Oracle
 
 from droid_jax.model.scene import TINY_FRICTIONLOSS
 from droid_jax.simulate.replay import Drive
@@ -50,6 +52,9 @@ def in_c(drive: Drive, oracle: Oracle, *, late: float) -> np.ndarray:
         return np.stack([np.interp(time, drive.time, column) for column in drive.command.T], axis=1)
 
     command = oracle.sent(v, at, look, servos) if oracle.sent else look(at)
+    read = {j: float(command[0, row] - data.qpos[dofs[j]]) for j, row in servos.items()}
+    for joint, twist in (oracle.twist(v, read) if oracle.twist else {}).items():
+        data.qpos[dofs[joint]] -= twist
     torque = np.empty((len(command), len(JOINTS)))
     for k, ctrl in enumerate(command):
         q, w, load = ({j: float(a[d]) for j, d in dofs.items()} for a in (data.qpos, data.qvel, data.qfrc_actuator))
@@ -109,6 +114,20 @@ def test_the_effect_is_what_c_does(exact: Bench, torques: dict[str, np.ndarray],
     places = [j for j in exact.effect(name).locations if j in oracle.joints] or oracle.joints
     apart = np.abs(torques[name] - torques[""]).max(axis=0)
     assert (apart[[JOINTS.index(j) for j in places]] > FAINT.get(name, 20) * tolerance).all()
+
+
+def test_a_compliant_joint_that_begins_under_load_is_what_c_does(exact: Bench):
+    """The recorded start is the encoder's: the servo holds the arm there, and the link is behind it."""
+    oracle, start = ORACLES["joint_compliance"], exact.drive.qpos0.copy()
+    for joint, load in (("shoulder", -8.0), ("elbow", 6.0)):  # N m
+        start[exact.scene.qpos(joint)] -= load / STIFFNESS[joint]
+    drive = replace(exact.drive, qpos0=start)
+    bench = make_bench(exact.scene, drive, [exact.effect("joint_compliance")], parity=True)
+    neutral, got = bench.torque({}, oracle.values)
+    np.testing.assert_allclose(got, in_c(drive, oracle, late=0.5), atol=PARITY)
+    np.testing.assert_allclose(neutral, bare(bench, parity=True).torque, atol=PARITY)
+    from_link = in_c(drive, replace(oracle, twist=None), late=0.5)
+    assert np.abs(got - from_link).max() > 20 * PARITY
 
 
 @pytest.mark.parametrize("name", ["hinge_preload", "joint_coulomb", "tilted_frame"])

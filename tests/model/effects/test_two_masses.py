@@ -172,10 +172,11 @@ def test_a_motion_that_begins_at_the_servos_limit_begins_with_its_twist():
     """The gear carries the limit and not what the servo is asked for."""
     scene = rigid(0.0, limit=1.0)
     (effect,) = library(scene, [RESONANCE])
-    assert effect.gear is not None
+    assert effect.gear is not None and effect.twist is not None
     still = jnp.zeros(1)
     state = State(jnp.float32(0.0), still, still, still, scene.mjx, motors=jnp.zeros((3, 1)))
-    motors, ahead = effect.gear.start({f"{RESONANCE}[j]": jnp.float32(2e-3)}, state, jnp.array([0.5]))
+    of_start = {f"{RESONANCE}[j]": jnp.float32(2e-3)}, state, jnp.array([0.5])
+    motors, ahead = effect.gear.start(*of_start), effect.twist(*of_start)
     np.testing.assert_allclose([motors[0, 0], ahead[0]], 2e-3 * 1.0, rtol=1e-6)
 
 
