@@ -120,12 +120,19 @@ def hide_joint_elasticity(place: Place, a: float) -> Influence:
     """Quasi-static elasticity: the motor is `twist` ahead of the link, and the encoder is on the motor.
 
     The servo's command is reduced by the twist of its torque after a lag of 3 ms (the motor's inertia on the spring).
-    The recorded position is the motor's.
+    The recorded position is the motor's.  The links begin behind it by the twist under which they are held.
     """
     loaded = np.zeros(len(place.dofs))
 
+    def begin(live: Live) -> None:
+        if a != 0.0:
+            mujoco.mj_forward(live.model, live.data)  # the links still stand where the motors do
+            loaded[:] = live.motor[place.dofs]
+            live.position[place.qpos] -= twist(a, loaded)
+
     def step(live: Live) -> None:
-        loaded[:] += (live.motor[place.dofs] - loaded) * (live.timestep / 0.003)
+        if live.data.time > 0.0:  # before the first step there is no torque of a step
+            loaded[:] += (live.motor[place.dofs] - loaded) * (live.timestep / 0.003)
         live.control[place.actuators] -= twist(a, loaded)
 
     def sense(signals: SensorInput) -> SensorInput:
@@ -133,7 +140,7 @@ def hide_joint_elasticity(place: Place, a: float) -> Influence:
         position[:, place.columns] += twist(a, signals.torque[:, place.columns])
         return SensorInput(signals.clock, signals.torque, position)
 
-    return Influence(step=step, sense=sense)
+    return Influence(begin=begin, step=step, sense=sense)
 
 
 def play(values: np.ndarray, width: float) -> np.ndarray:

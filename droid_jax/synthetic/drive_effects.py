@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import scipy.optimize
 
 from droid_jax.recordings.recording import TorqueSide
 from droid_jax.synthetic.hooks import Hidden, Influence, Live, Place, SensorInput
@@ -26,7 +27,7 @@ Spring = Callable[[float, float], float]  # lead of the motor, rad and rad/s -> 
 def hide_resonance(place: Place, a: float) -> Influence:
     """A motor with the joint's armature on a gear of compliance a rad/(N m), which stiffens by a third at 0.02 rad.
 
-    Its encoder is on the motor.
+    Its encoder is on the motor.  The link begins behind it by the twist under which it is held.
     """
 
     def gear(inertia: float) -> Spring:
@@ -84,6 +85,8 @@ def _motors(place: Place, gear: Callable[[float], Spring], encoder_on_motor: boo
     def begin(live: Live) -> None:
         for motor in motors:
             motor.angle, motor.speed = float(live.position[motor.position]), 0.0
+            if encoder_on_motor:
+                live.position[motor.position] -= wound(motor.gear, motor.servo(live)())
 
     def step(live: Live) -> None:
         angles.append([motor.angle for motor in motors])
@@ -98,6 +101,14 @@ def _motors(place: Place, gear: Callable[[float], Spring], encoder_on_motor: boo
         return SensorInput(signals.clock, torque, position)
 
     return Influence(edit=edit, begin=begin, step=step, sense=sense)
+
+
+def wound(gear: Spring, torque: float) -> float:
+    """The lead at which a gear at rest carries a torque, rad."""
+    end = math.copysign(1e-6, torque)
+    while abs(gear(end, 0.0)) < abs(torque):
+        end *= 2.0
+    return float(scipy.optimize.root_scalar(lambda lead: gear(lead, 0.0) - torque, bracket=(0.0, end), xtol=1e-12).root)
 
 
 @dataclass
@@ -123,23 +134,32 @@ class _Motor:
     angle: float = 0.0
     speed: float = 0.0
 
+    def servo(self, live: Live) -> Callable[[], float]:
+        """The servo's torque under the command, N m, as a function of the motor's state."""
+        model, u = live.model, self.actuator
+        gain, ratio = self.gain, float(model.actuator_gear[u, 0])
+        b0, b1, b2 = self.bias
+        command, (low, high) = float(live.control[u]), _limits(model, u, self.dof)
+        if model.actuator_ctrllimited[u]:
+            command = min(max(command, float(model.actuator_ctrlrange[u, 0])), float(model.actuator_ctrlrange[u, 1]))
+
+        def torque() -> float:
+            asked = ratio * (gain * command + b0 + ratio * (b1 * self.angle + b2 * self.speed))
+            return min(max(asked, low), high)
+
+        return torque
+
     def turn(self, live: Live) -> float:
         """Move through one step, and put the gear's mean torque on the link, in place of the actuator's.
 
         Returns the motor's mean torque, N m.
         """
-        model, u = live.model, self.actuator
-        gain, ratio = self.gain, float(model.actuator_gear[u, 0])
-        b0, b1, b2 = self.bias
         link, moving = float(live.position[self.position]), float(live.velocity[self.dof])
-        command, (low, high) = float(live.control[u]), _limits(model, u, self.dof)
-        if model.actuator_ctrllimited[u]:
-            command = min(max(command, float(model.actuator_ctrlrange[u, 0])), float(model.actuator_ctrlrange[u, 1]))
+        servo = self.servo(live)
         parts = max(1, math.ceil(live.timestep / SUBSTEP - 1e-9))
         h, mean, given = live.timestep / parts, 0.0, 0.0
         for part in range(parts):
-            torque = ratio * (gain * command + b0 + ratio * (b1 * self.angle + b2 * self.speed))
-            torque = min(max(torque, low), high)
+            torque = servo()
             force = self.gear(self.angle - link - part * h * moving, self.speed - moving)
             self.speed += h * (torque - force) / self.inertia
             self.angle += h * self.speed

@@ -127,7 +127,8 @@ class Influence:
     Attributes:
         edit: changes the model.
         command: (clock [T] s, command [T, U]) -> command [T, U].
-        begin: is called once, in the start pose.
+        begin: is called once, in the start pose and, in recordings, with the first command in `Live.control`.
+            It may move links behind their encoders, which read the start pose.
         step: is called before each mj_step.
         sense: changes the input of the sensors.
     """
@@ -197,7 +198,7 @@ def step_through(
 
     Args:
         model: instrumented; it is not changed.
-        qpos0: [nq] start pose.
+        qpos0: [nq] start pose, as the encoders read it.
         control: [T, U] commands.
         influences: the effects.
         gears: [T, nv] an output, N m, torques of effects between motors and links.
@@ -207,7 +208,7 @@ def step_through(
     """
     model = copy.copy(model)
     data = mujoco.MjData(model)
-    data.qpos[:] = qpos0
+    data.qpos[:], data.ctrl[:] = qpos0, control[0]
     model_loss = model.dof_frictionloss.copy()
     live, advance = start_simulation(model, data, influences)
     rows, sensors = np.empty((len(control), model.nsensordata)), data.sensordata

@@ -517,6 +517,25 @@ def test_an_elastic_joint_at_rest_balances_servo_and_spring(scene: Scene, demons
     assert position == pytest.approx(sag, abs=1e-4)  # the link, not the motor, has sunk
 
 
+@pytest.mark.parametrize("name", ["joint_elasticity", "resonance"])
+def test_an_elastic_joint_that_holds_a_weight_begins_at_rest(scene: Scene, demonstration: Recording, name: str):
+    """The start is the encoder's reading: the link begins behind it, where its gear carries the servo's torque."""
+    command = np.tile([0.0, 0.9, 0.3], (401, 1))
+    quiet = dict(torque_noise=(0.0, 0.0), torque_drift=(0.0, 0.0), position_noise=0.0, start_noise=0.0)
+
+    def held(qpos0: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        still = replace(demonstration, command=command, qpos0=qpos0)
+        found = hidden(scene, still, Applied(name, 1e-3, "shoulder"), **quiet)
+        return found.channel("position").values[0], found.channel("torque").values[0]
+
+    fallen, _ = held({"flap": 0.0, "shoulder": 0.9, "elbow": 0.3})
+    position, torque = held(dict(zip(scene.joints, fallen[-1].astype(float).tolist(), strict=True)))
+    assert abs(torque[0, 1]) > 1.0  # N m, which twist the gear by more than 1 mrad
+    np.testing.assert_allclose(position[0, 1:], fallen[-1, 1:], atol=1e-7)
+    assert np.ptp(position[:, 1:], axis=0).max() < 3e-5
+    assert np.ptp(torque[:, 1:], axis=0).max() < 0.01 * abs(torque[0, 1])
+
+
 def test_play_by_hand():
     values = np.array([0.0, 0.4, 1.0, 0.6, -0.2, -0.1, 0.9])[:, None]
     np.testing.assert_allclose(arm_effects.play(values, 1.0)[:, 0], [0, 0, 0.5, 0.5, 0.3, 0.3, 0.4])
