@@ -501,17 +501,16 @@ def tied(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that ends with a tie at once."""
     done = small()
     monkeypatch.setattr(missing, "base_fit", lambda *a: done.base)
-    monkeypatch.setattr(
-        missing, "search_effects", lambda *a: replace(done.verdict, indistinguishable_models=(done.base,))
-    )
+    verdict = replace(done.verdict, indistinguishable_models=((done.verdict.model, done.base),))
+    monkeypatch.setattr(missing, "search_effects", lambda *a: verdict)
 
 
 def test_ties_come_with_an_experiment(place: Path, quick: None, monkeypatch: pytest.MonkeyPatch):
     """The command computes which experiment would distinguish the alternatives, on the fitted recording."""
     asked = []
 
-    def apart(case, models, recording):
-        asked.append(([m.name for m in models], recording.name))
+    def apart(case, groups, recording):
+        asked.append(([m.name for group in groups for m in group], recording.name))
         return (Experiment("the same motion twice as fast", 8.5), Experiment("slower", None, "too long"))
 
     tied(monkeypatch)

@@ -184,7 +184,7 @@ def amended(
 def _with_experiments(now: Amended, case: Case, recording: Recording) -> Amended:
     verdict = now.verdict
     try:
-        experiments = separating_experiments(case, (verdict.model, *verdict.indistinguishable_models), recording)
+        experiments = separating_experiments(case, verdict.indistinguishable_models, recording)
     except Exception as error:  # of any kind: the verdict does not depend on it
         return _state(now, EXPERIMENTS, f"{NOT_MADE}: {reason(error)}")
     return _state(replace(now, verdict=replace(verdict, experiments=experiments)), EXPERIMENTS, MADE)
@@ -204,7 +204,9 @@ def _state(now: Amended, name: str, state: str) -> Amended:
     return replace(now, states={**now.states, name: state})
 
 
-def separating_experiments(case: Case, models: Sequence[FittedModel], recording: Recording) -> tuple[Experiment, ...]:
+def separating_experiments(
+    case: Case, groups: Sequence[Sequence[FittedModel]], recording: Recording
+) -> tuple[Experiment, ...]:
     """Candidate experiments by the distance of the two models that they distinguish least, the largest first.
 
     They are variants of the training motion that can be recorded on the same set-up: another time scaling (slower,
@@ -213,28 +215,33 @@ def separating_experiments(case: Case, models: Sequence[FittedModel], recording:
 
     Args:
         case: the recordings.
-        models: indistinguishable models, each refitted.
+        groups: of indistinguishable models, each refitted.  Models of different groups are not compared.
         recording: the training recording.
 
     Returns:
         The experiments.  Those that cannot be simulated come last, with the reason.  Empty for a log without commands,
         whose motion cannot be repeated.
     """
-    if len(models) < 2 or not recording.command.size:
+    models = [model for group in groups for model in group]
+    of_group = [number for number, group in enumerate(groups) for _ in group]
+    pairs = [(i, j) for i, j in itertools.combinations(range(len(models)), 2) if of_group[i] == of_group[j]]
+    if not pairs or not recording.command.size:
         return ()
     values = np.stack([m.values for m in models])
-    experiments = [_simulated(what, make) for what, make in _possible(case, values, recording)]
+    experiments = [_simulated(what, make) for what, make in _possible(case, values, pairs, recording)]
     return tuple(sorted(experiments, key=lambda e: -np.inf if e.distance is None else e.distance, reverse=True))
 
 
-def _possible(case: Case, values: np.ndarray, recording: Recording) -> Iterator[tuple[str, Callable[[], Experiment]]]:
-    """Experiments in this scene: a description, and a function that simulates the models [K, D]."""
+def _possible(
+    case: Case, values: np.ndarray, pairs: Sequence[tuple[int, int]], recording: Recording
+) -> Iterator[tuple[str, Callable[[], Experiment]]]:
+    """Experiments in this scene: a description, and a function that simulates the models [K, D] of these pairs."""
     known = case.train.cost
     config = case.train.comparison.config
 
     def moved(what: str, motion: Callable[[], Recording]) -> Experiment:
         cost = make_cost(known.scene, case.full_space, [motion()], config=config, effects=case.effects, check=False)
-        return _experiment(what, cost, values)
+        return _experiment(what, cost, values, pairs)
 
     for entry in TIME_SCALINGS:
         yield entry.what, functools.partial(moved, entry.what, functools.partial(time_scaled, recording, entry))
@@ -246,12 +253,12 @@ def _possible(case: Case, values: np.ndarray, recording: Recording) -> Iterator[
         def in_the_air() -> Experiment:
             alone, scene = replace(config, channels=channels), untouched(known.scene)
             cost = make_cost(scene, case.full_space, [recording], config=alone, effects=case.effects, check=False)
-            return _experiment(IN_THE_AIR, cost, values)
+            return _experiment(IN_THE_AIR, cost, values, pairs)
 
         yield IN_THE_AIR, in_the_air
     if case.full_space.of_role(Role.PAYLOAD_MASS):
         what = f"the same motion with {WEIGHT:g} kg more, weighed, at the hand"
-        yield what, lambda: _experiment(what, known, _carrying(case, values))
+        yield what, lambda: _experiment(what, known, _carrying(case, values), pairs)
 
 
 def _simulated(what: str, make: Callable[[], Experiment]) -> Experiment:
@@ -283,8 +290,8 @@ def _further(known: AnyCost, recording: Recording, values: np.ndarray) -> Record
     return longer
 
 
-def _experiment(what: str, cost: AnyCost, values: np.ndarray) -> Experiment:
-    """The distance of those two of the models [K, D] that an experiment distinguishes least.
+def _experiment(what: str, cost: AnyCost, values: np.ndarray, pairs: Sequence[tuple[int, int]]) -> Experiment:
+    """The distance of that pair of the models [K, D] that an experiment distinguishes least.
 
     Raises:
         ValueError: a replay fails.
@@ -292,7 +299,7 @@ def _experiment(what: str, cost: AnyCost, values: np.ndarray) -> Experiment:
     if cost.failed(values).any():
         raise ValueError("the simulation of one of the models fails on this motion")
     simulated = cost.whitened(values).astype(np.float64)
-    least = min(float(np.linalg.norm(a - b)) for a, b in itertools.combinations(simulated, 2))
+    least = min(float(np.linalg.norm(simulated[i] - simulated[j])) for i, j in pairs)
     return Experiment(what, least)
 
 

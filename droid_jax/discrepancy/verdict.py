@@ -84,7 +84,8 @@ class Verdict:
     score_tests, validation_tests: all tests, in the order in which they were made.
     failed: names of models whose replay blew up at the start of their refit, on the validation recording, or on the
         test recording, which then is not in `discrepancies`.
-    indistinguishable_models: refitted models that are indistinguishable from `model`.
+    indistinguishable_models: groups of refitted models that are indistinguishable from each other, one for each step
+        whose choice is open, the chosen one first.  Those of an earlier step lack the effects of later ones.
     experiments: experiments that would distinguish them, the best first.
     ruled_out: names of models that were not refitted, since after one step they were too far from the best ones.
     not_tried: fits that were skipped for lack of time, in words.
@@ -107,7 +108,7 @@ class Verdict:
     config: SelectionConfig
     remainder: float | None = None
     failed: tuple[str, ...] = ()
-    indistinguishable_models: tuple[FittedModel, ...] = ()
+    indistinguishable_models: tuple[tuple[FittedModel, ...], ...] = ()
     experiments: tuple[Experiment, ...] = ()
     ruled_out: tuple[str, ...] = ()
     not_tried: tuple[str, ...] = ()
@@ -264,7 +265,7 @@ def conclude(
         after=localise(case.train, model.values, model.residuals, model.values),
         config=config,
         failed=(*failed, *failed_on_test),
-        indistinguishable_models=next((s.indistinguishable for s in reversed(steps) if s.selected is not None), ()),
+        indistinguishable_models=_indistinguishable_models(model, steps),
         ruled_out=_not_refitted(ruled_out, tests, failed),
         not_tried=not_tried,
         trend=trend(first, base.residuals, case.config.seed) if first is not None and repeated else None,
@@ -363,11 +364,35 @@ def _alternatives(part: EffectKey, model: FittedModel, steps: Sequence[Selection
     They are those of the last step that selected the effect.  An alternative that replaces several effects of the model
     is listed for each of them.
     """
-    present = set(model.keys)
-    for done in reversed(steps):
-        added = set(done.selected.keys) - set(done.before) if done.selected is not None else set()
-        if part in added:
-            others = [set(m.keys) - set(done.before) for m in done.indistinguishable]
-            instead = {tuple(sorted(o - added)) for o in others if part not in o and not (o - added) & present}
-            return tuple(sorted(keys for keys in instead if keys))
-    return ()
+    present, done = set(model.keys), _selecting(part, steps)
+    if done is None:
+        return ()
+    added, others = _added(done), [set(m.keys) - set(done.before) for m in done.indistinguishable]
+    instead = {tuple(sorted(o - added)) for o in others if part not in o and not (o - added) & present}
+    return tuple(sorted(keys for keys in instead if keys))
+
+
+def _added(done: SelectionStep) -> set[EffectKey]:
+    """The effects that a step selected."""
+    return set() if done.selected is None else set(done.selected.keys) - set(done.before)
+
+
+def _selecting(part: EffectKey, steps: Sequence[SelectionStep]) -> SelectionStep | None:
+    """The last step that selected an effect."""
+    return next((done for done in reversed(steps) if part in _added(done)), None)
+
+
+def _indistinguishable_models(
+    model: FittedModel, steps: Sequence[SelectionStep]
+) -> tuple[tuple[FittedModel, ...], ...]:
+    """The model that each deciding step selected, with those indistinguishable from it, where there are any.
+
+    A step decides if it is the last one that selected some effect of `model`.
+    """
+    deciding = [_selecting(key, steps) for key in model.keys]
+    groups = list[tuple[FittedModel, ...]]()
+    for done in steps:
+        if done.selected is not None and done.indistinguishable and any(done is each for each in deciding):
+            chosen = model if set(model.keys) == set(done.selected.keys) else done.selected
+            groups.append((chosen, *done.indistinguishable))
+    return tuple(groups)

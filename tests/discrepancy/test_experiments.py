@@ -43,7 +43,7 @@ def test_another_speed_distinguishes_drag_from_a_preload(demonstration, monkeypa
     """The models differ in a torque that grows with speed, so their distance does too."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:2])
     models = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.distance or 0.0 for e in separating_experiments(small().case, models, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(small().case, [models], demonstration)}
     slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
     assert faster > 3.0 * slower > 0.0
     weighed = next(apart for what, apart in found.items() if "weighed" in what)
@@ -61,7 +61,7 @@ def test_an_experiment_that_fails_states_the_reason_and_does_not_end_the_search(
 
     monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:3])
     monkeypatch.setattr(missing, "make_cost", short_of_memory)
-    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    found = separating_experiments(small().case, [(model("drag", 0.0), model("drag", 0.8))], demonstration)
     said = {e.what: (e.distance is None, e.not_made) for e in found}
     assert said[TIME_SCALINGS[0].what] == (True, "needs 9.0 GB")
     assert said[TIME_SCALINGS[1].what] == (False, "")
@@ -81,7 +81,7 @@ def dropped(recording: Recording, seconds: float) -> Recording:
 def test_a_dropout_that_is_too_long_in_a_slower_motion_is_reported(demonstration):
     """A gap of 60 ms is interpolated; three times slower it is too long for that."""
     models = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e for e in separating_experiments(small().case, models, dropped(demonstration, 0.06))}
+    found = {e.what: e for e in separating_experiments(small().case, [models], dropped(demonstration, 0.06))}
     slower, faster = (found[entry.what] for entry in TIME_SCALINGS[:2])
     assert slower.distance is None and "a stretch that no repeat measured" in slower.not_made
     assert faster.distance is not None and faster.distance > 0.0
@@ -92,7 +92,7 @@ def test_a_known_weight_does_not_distinguish_payloads_or_preloads(demonstration,
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     case = small().case
     models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
-    (found,) = separating_experiments(case, models, demonstration)
+    (found,) = separating_experiments(case, [models], demonstration)
     plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
     assert f"{WEIGHT:g} kg" in found.what
     assert found.distance == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
@@ -110,11 +110,11 @@ def test_in_the_air_the_object_has_no_part_and_a_hand_that_reaches_no_further_is
     monkeypatch.setattr(missing, "opened_further", lambda *arguments: None)
     case = small().case
     models = (model("payload_mass", 0.0), model("payload_mass", 0.2))
-    found = {e.what: e for e in separating_experiments(gripping(case), models, demonstration)}
+    found = {e.what: e for e in separating_experiments(gripping(case), [models], demonstration)}
     plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
     assert found[IN_THE_AIR].distance == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=0.2)
     assert found[FURTHER].distance is None and "does not reach further" in found[FURTHER].not_made
-    assert IN_THE_AIR not in {e.what for e in separating_experiments(case, models, demonstration)}
+    assert IN_THE_AIR not in {e.what for e in separating_experiments(case, [models], demonstration)}
 
 
 @pytest.mark.slow
@@ -124,8 +124,8 @@ def test_a_motion_opened_further_is_an_experiment(demonstration, monkeypatch):
     monkeypatch.setattr(missing, "opened_further", lambda scene, recording, replayed: replace(recording, name=FURTHER))
     case = small().case
     models = (model("drag", 0.0), model("drag", 0.8))
-    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), models, demonstration)}
-    assert FURTHER not in {e.what for e in separating_experiments(case, models, demonstration)}
+    found = {e.what: e.distance or 0.0 for e in separating_experiments(gripping(case), [models], demonstration)}
+    assert FURTHER not in {e.what for e in separating_experiments(case, [models], demonstration)}
     plain = case.train.cost.whitened(np.stack([m.values for m in models])).astype(float)
     assert found[FURTHER] == pytest.approx(np.linalg.norm(plain[0] - plain[1]), rel=1e-3)
 
@@ -160,32 +160,34 @@ def test_the_distance_is_that_of_the_two_nearest_models(demonstration, monkeypat
     column = case.full_space.index("drag")
     known = weighed(case, lambda rows: np.array([[at[row[column]], 0.0] for row in rows]))
     models = tuple(model("drag", drag) for drag in (0.2, 0.0, 0.1))
-    (found,) = separating_experiments(known, models, demonstration)
+    (found,) = separating_experiments(known, [models], demonstration)
     assert (found.distance, found.not_made) == (1.0, "")
+    (found,) = separating_experiments(known, [models[:2], models[::2]], demonstration)
+    assert found.distance == 5.0  # models of different groups are not compared
 
 
 def test_an_experiment_on_which_a_model_fails_has_no_distance(demonstration, monkeypatch):
     """Its distance would be NaN."""
     monkeypatch.setattr(missing, "TIME_SCALINGS", ())
     known = weighed(small().case, lambda rows: pytest.fail("one of the models fails"), failed=True)
-    (found,) = separating_experiments(known, (model("drag", 0.0), model("drag", 0.1)), demonstration)
+    (found,) = separating_experiments(known, [(model("drag", 0.0), model("drag", 0.1))], demonstration)
     assert found.distance is None and "fails on this motion" in found.not_made
 
 
 def test_a_log_without_commands_has_no_experiments(demonstration):
     log = replace(demonstration, command=np.zeros((0, 0)), command_names=())
-    assert separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), log) == ()
+    assert separating_experiments(small().case, [(model("drag", 0.0), model("drag", 0.8))], log) == ()
 
 
 def test_the_best_experiment_comes_first(demonstration, monkeypatch):
     monkeypatch.setattr(missing, "TIME_SCALINGS", TIME_SCALINGS[:2])
-    found = separating_experiments(small().case, (model("drag", 0.0), model("drag", 0.8)), demonstration)
+    found = separating_experiments(small().case, [(model("drag", 0.0), model("drag", 0.8))], demonstration)
     apart = [e.distance or 0.0 for e in found]
     assert apart == sorted(apart, reverse=True) and apart[0] > apart[-1]
 
 
 def test_one_model_needs_no_experiment(demonstration):
-    assert separating_experiments(small().case, (model("drag", 0.0),), demonstration) == ()
+    assert separating_experiments(small().case, [(model("drag", 0.0),)], demonstration) == ()
 
 
 @pytest.mark.parametrize(

@@ -149,7 +149,7 @@ def found() -> Small:
 
 def with_an_alternative(found: Small) -> Verdict:
     """The verdict as if the base model were indistinguishable from its model."""
-    return replace(found.verdict, indistinguishable_models=(found.base,))
+    return replace(found.verdict, indistinguishable_models=((found.verdict.model, found.base),))
 
 
 def another_model(found: Small) -> FinalModel:
@@ -166,7 +166,7 @@ def failing(error: BaseException) -> Callable[..., Any]:
 
 def test_the_verdict_comes_first_and_then_each_amendment(found: Small, monkeypatch: pytest.MonkeyPatch):
     open_verdict, refitted = with_an_alternative(found), another_model(found)
-    monkeypatch.setattr(missing, "separating_experiments", lambda case, models, recording: FASTER)
+    monkeypatch.setattr(missing, "separating_experiments", lambda case, groups, recording: FASTER)
     monkeypatch.setattr(missing, "final_refit", lambda *arguments: refitted)
     first, second, third = amended(found.case, open_verdict, record("train"))
     assert first.states == {EXPERIMENTS: TO_BE_MADE, REFIT: TO_BE_MADE}

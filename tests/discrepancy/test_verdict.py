@@ -260,11 +260,27 @@ def test_alternatives_make_the_verdict_indistinguishable_and_their_models_are_in
     rejected = replace(made.tests[1], reasons=(Rejection(Reason.RARELY_BEST, ""),))
     verdict = conclude(found.case, found.base, made_up(found, "a"), (made,), FLOOR)
     assert verdict.conclusion is Conclusion.INDISTINGUISHABLE
-    assert [m.keys for m in verdict.indistinguishable_models] == [at_door("x")]
+    assert [[m.keys for m in group] for group in verdict.indistinguishable_models] == [[at_door("a"), at_door("x")]]
     alone = conclude(
         found.case, found.base, made_up(found, "a"), (replace(made, tests=(made.tests[0], rejected)),), FLOOR
     )
     assert alone.conclusion is Conclusion.NAMED and alone.indistinguishable_models == ()
+
+
+def groups(found: Small, names: str, *made: SelectionStep) -> list[list[str]]:
+    """The groups of indistinguishable models of a verdict, one letter for each effect."""
+    verdict = conclude(found.case, found.base, made_up(found, names), made, FLOOR)
+    return [["".join(k.effect for k in m.keys) for m in group] for group in verdict.indistinguishable_models]
+
+
+def test_the_models_of_every_step_whose_choice_is_open_are_in_the_verdict(found: Small):
+    """Without those of the first step no experiment would be computed for its alternatives."""
+    first, second = selecting(found, "", "a", "x"), selecting(found, "a", "ab")
+    assert groups(found, "ab", first, second) == [["a", "x"]]
+    assert groups(found, "ab", first, selecting(found, "a", "ab", "ay")) == [["a", "x"], ["ab", "ay"]]
+    assert groups(found, "ab", selecting(found, "", "a"), selecting(found, "a", "ab", "ay")) == [["ab", "ay"]]
+    assert groups(found, "ab", first, selecting(found, "", "ab")) == []  # the pair was chosen anew
+    assert groups(found, "b", first, second) == []  # a was taken out again
 
 
 # In words -----------------------------------------------------------------------------------
