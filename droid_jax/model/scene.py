@@ -60,6 +60,7 @@ class Scene:
         held: joints whose friction constraint is hard here and soft in the MJCF (`load_scene`).
         hold: whether friction constraints that effects add are hard too (`effects.registry.ready`).
         variant: numbers that the model has in place of the MJCF's (`model.variant`), as JSON; empty: none.
+        varied: the scene that a variant was made of; None for other scenes.
     """
 
     name: str
@@ -73,6 +74,12 @@ class Scene:
     held: tuple[str, ...] = ()
     hold: bool = False
     variant: str = ""
+    varied: Scene | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def nominal(self) -> Scene:
+        """The scene with the numbers of its MJCF, those of no recording."""
+        return self.varied or self
 
     def id(self, kind: str, name: str) -> int:
         """Id of a named element; kind is "joint", "body", "geom", "pair", "actuator" or "site"."""

@@ -117,7 +117,7 @@ def _made(scene: Scene, key: str) -> Scene:
     model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, least)
     settle(model, written, derive=True)
     refuse_ignored(model, scene.name)
-    return replace(scene, model=model, variant=key)
+    return replace(scene, model=model, variant=key, varied=scene)
 
 
 def _stated(key: str) -> Iterator[tuple[str, str, list[float]]]:

@@ -248,12 +248,58 @@ def test_relative_effects_act_on_the_gain_that_a_recording_states(setups: Simple
 
 
 def test_effects_that_the_scene_of_a_variant_would_not_get(setups: SimpleNamespace):
-    """Without weight an encoder's zero changes nothing, and a load has no moment."""
+    """Without weight an encoder's zero changes nothing; without stiffness a gear's compliance has no servo."""
     own = variant_scene(setups.scene, {"opt": {"gravity": [0.0, 0.0, 0.0]}})
-    offset, load = library(setups.scene, ["encoder_offset", "free_payload"])
-    assert library(own, ["encoder_offset", "free_payload"]) == () and in_variant(own, (offset,)) == (offset,)
-    with pytest.raises(ValueError, match=r"'free_payload': leave it out \(--without free_payload\)"):
-        in_variant(own, (load,))
+    offset, gear = library(setups.scene, ["encoder_offset", "joint_compliance"])
+    assert library(own, ["encoder_offset"]) == () and in_variant(own, (offset,)) == (offset,)
+    own = variant_scene(setups.scene, numbers_that_differ(setups.scene, scene_of(arm(), kp=0.0)))
+    with pytest.raises(ValueError, match=r"'joint_compliance': leave it out \(--without joint_compliance\)"):
+        in_variant(own, (gear,))
+
+
+def law_in(setups: SimpleNamespace, name: str, stated: dict[str, Any], values: dict[str, float], law: str, q: float):
+    """A law of an effect in a variant, at a position q [rad] and 1 rad/s."""
+    own, effects = variant_scene(setups.scene, stated), library(setups.scene, [name])
+    (effect,) = in_variant(own, effects)
+    theta = {p.name: jnp.float32(values[p.name.split("[")[0]]) for p in effect.parameters}
+    state = State(jnp.float32(0), jnp.array([q]), jnp.ones(1), jnp.zeros(1), own.mjx)
+    return np.asarray(getattr(effect, law)(theta, state)).ravel()
+
+
+def test_the_unit_of_a_slope_is_the_same_in_all_recordings(setups: SimpleNamespace):
+    """A limit falls by the same N m per rad/s on an empty arm and on a loaded one, whose usual torque is larger."""
+    values = {"torque_speed_line": 0.1, "torque_speed_slope": 0.2}
+    empty, loaded = (
+        law_in(setups, "torque_speed_line", setups.logs[name].variant, values, "limits", 0.0)
+        for name in ("empty", "loaded")
+    )
+    assert np.isfinite(empty).all() and not np.allclose(empty, [-10.0, 10.0])
+    np.testing.assert_allclose(loaded, empty, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("payload", {"payload_mass": 0.0, "payload_moment": 0.1}),
+        ("free_payload", {"load_mass": 0.0, "load_moment_x": 0.1, "load_moment_z": 0.05}),
+    ],
+)
+def test_a_load_hangs_at_the_same_place_in_all_recordings(setups: SimpleNamespace, name: str, values: dict[str, float]):
+    """Also on an arm whose heaviest body, or centre of mass, is another one with the recording's numbers."""
+    plain = law_in(setups, name, {}, values, "force", 0.3)
+    assert abs(plain[0]) > 1e-3
+    heavy = {"body_mass": {"payload": [5.0]}, "body_quat": {"payload": [0.6, 0.0, 0.8, 0.0]}}
+    aside = {"body_ipos": {"arm": [0.1, 0.0, 0.0]}}
+    for stated in (heavy, aside):
+        np.testing.assert_allclose(law_in(setups, name, stated, values, "force", 0.3), plain, rtol=1e-5)
+    weightless = law_in(setups, name, {"opt": {"gravity": [0.0, 0.0, 0.0]}}, values, "force", 0.3)
+    assert weightless == pytest.approx(0.0, abs=1e-9)
+
+
+def test_gravity_leans_about_the_same_axes_in_all_recordings(setups: SimpleNamespace):
+    """The recordings share the angle about y, although x and z are nearer to perpendicular to this gravity."""
+    stated, values = {"opt": {"gravity": [0.0, 9.0, 3.0]}}, {"gravity_about_y": 0.1}
+    assert abs(law_in(setups, "gravity_direction", stated, values, "force", 0.3)[0]) > 1e-2
 
 
 def test_findings_and_evaluations_are_of_the_variant(setups: SimpleNamespace):

@@ -25,7 +25,8 @@ def gravity_direction(scene: Scene) -> Effect | None:
     """
     if not a.arm(scene):
         return None
-    axes = [axis for axis in _horizontal(scene) if _largest_torque(scene, axis) > LEAST_TORQUE]
+    nominal = scene.nominal  # all recordings share the angles, also one with numbers of its own
+    axes = [axis for axis in _horizontal(nominal) if _largest_torque(nominal, axis) > LEAST_TORQUE]
     if not axes:
         return None
     names = [f"{NAME}_{'xyz'[axis]}" for axis in axes]

@@ -27,7 +27,8 @@ def payload(scene: Scene) -> Effect | None:
 
     The gravity of the nominal mass is still compensated, that of the payload is not.  r is the distance of the load's
     centre of mass from the body's, on the line from the last joint.  The inertia of the moment is neglected: at
-    1 rad/s^2 it is a tenth of its weight.
+    1 rad/s^2 it is a tenth of its weight.  Body and line are those of the MJCF also for a recording with numbers of its
+    own, since all recordings share m and r; the weight acts along that recording's gravity, on its arm.
     """
     if (carried := _carried(scene)) is None:
         return None
@@ -78,7 +79,8 @@ def free_payload(scene: Scene) -> Effect | None:
 
 
 def _carried(scene: Scene) -> tuple[str, int] | None:
-    """The arm's last joint and the body that carries a load; None if there is no body with a mass."""
+    """The arm's last joint and the body of the MJCF that carries a load; None if there is no body with a mass."""
+    scene = scene.nominal
     joints = a.arm(scene)
     if not joints:
         return None
@@ -89,6 +91,7 @@ def _carried(scene: Scene) -> tuple[str, int] | None:
 
 def _active_axes(scene: Scene, body: int) -> np.ndarray:
     """[3] bool, axes of a body's frame along which a moment causes a torque at a measured joint in some pose."""
+    scene = scene.nominal
     model, data = scene.model, mujoco.MjData(scene.model)
     rng, turning, most = np.random.default_rng(0), np.zeros((3, model.nv)), np.zeros(3)
     for _ in range(POSES):
@@ -118,7 +121,7 @@ def _added_mass(scene: Scene, body: int, name: str, role: Role = Role.OTHER) -> 
 
 def _outward_moment(scene: Scene, joint: str, body: int) -> Callable[[Theta, State], jax.Array] | None:
     """Joint torques of a load's moment along `_outwards`; None without this direction, or if the body floats."""
-    outwards = _outwards(scene, joint, body)
+    outwards = _outwards(scene.nominal, joint, body)
     if outwards is None:
         return None
     direction = jnp.asarray(outwards, jnp.float32)

@@ -142,8 +142,9 @@ def ready(scene: Scene) -> Scene:
 def in_variant(scene: Scene, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
     """The effects with the laws that they have in a scene with the numbers of one recording (`model.variant`).
 
-    A law may hold numbers of the scene that it was made for, such as where a load hangs.  Their parameters stay, and
-    so do effects without laws.  Raises ValueError for an effect with a law that such a scene cannot have.
+    A law may hold numbers of the scene that it was made for, such as gravity.  What gives its parameters their meaning
+    (where a load hangs, the unit of a slope) it takes from `Scene.nominal`.  The parameters stay, and so do effects
+    without laws.  Raises ValueError for an effect with a law that such a scene cannot have.
     """
     if not scene.variant:
         return effects

@@ -25,14 +25,16 @@ USUAL_SPEED = 1.0  # rad/s, of motions that are recorded
 def torque_speed_line(scene: Scene) -> Effect | None:
     """Torques between -1/p - s t w and 1/p - s t w; p in 1/(N m) for each joint, s in s/rad for all.
 
-    t is a usual torque of the joint, so that s is one over the speed at which the limit has fallen by as much.
+    t is a usual torque of the joint, so that s is one over the speed at which the limit has fallen by as much.  It is
+    that of the MJCF also for a recording with numbers of its own, since all recordings share s.
     """
     servos = arm_servos(scene)
     if servos is None:
         return None
 
-    friction = USUAL_SPEED * scene.model.dof_damping[servos.dofs] + scene.model.dof_frictionloss[servos.dofs]
-    usual = usual_torques(scene, servos.joints) + friction
+    nominal = scene.nominal
+    friction = USUAL_SPEED * nominal.model.dof_damping[servos.dofs] + nominal.model.dof_frictionloss[servos.dofs]
+    usual = usual_torques(nominal, servos.joints) + friction
 
     def limits(theta, state):
         inverse, none = column(theta, LINE, servos.joints), jnp.array([-jnp.inf, jnp.inf])
