@@ -19,6 +19,7 @@ import numpy as np
 from droid_jax.files import APPLY_FIT, FITTED_JSON, MJLAB_TERMS
 from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
+from droid_jax.model.actuators import drives_joint
 from droid_jax.model.effect_interface import MOVING, Effect, has_law
 from droid_jax.model.inertia import PSEUDO_INERTIA, TERMS, WEIGHTS, root_of
 from droid_jax.model.law_tables import LawTable, NoTable, law_tables
@@ -29,6 +30,7 @@ from droid_jax.model.scene import Scene
 from droid_jax.storage import write_bytes, write_text
 
 DIGITS = 7  # significant digits of the tables
+LOSS = "dof_frictionloss"
 DRAWS = 1000  # for the interval of a number that several parameters write
 # Why a parameter of a role is not in the MJCF.
 NOT_IN_MJCF = {
@@ -148,7 +150,7 @@ def neutral_json(
         "table": [{k: v for k, v in row.items() if k != "own"} for row in rows],
         "inertias": inertias,
         "laws": [_law(law) for law in tables if isinstance(law, LawTable)],
-        "drives": _drives(scene, make_c_model(scene, space, np.asarray(values))),
+        "drives": _drives(scene, space, effects, np.asarray(values), tables),
         "not_in_mjcf": _lacking(scene, space, effects, tables),
         "mjcf": {
             "file": None if mjcf is None else next(iter(mjcf.files)),
@@ -167,9 +169,22 @@ def neutral_json(
     }
 
 
-def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """The position servo of each driven joint in the terms of Isaac Lab and Newton, all at the joint's side."""
-    out: list[dict[str, Any]] = []
+def _drives(
+    scene: Scene, space: Space, effects: Sequence[Effect], values: np.ndarray, tables: Sequence[LawTable | NoTable]
+) -> list[dict[str, Any]]:
+    """The position servo of each driven joint in the terms of Isaac Lab and Newton, all at the joint's side.
+
+    The damping is that of all actuators of the joint, the friction with the constant one of effects.  Other laws of
+    effects on the joint are named.
+    """
+    model, out = make_c_model(scene, space, values), list[dict[str, Any]]()
+    friction, rigid = model.dof_frictionloss.copy(), set[str]()  # rigid: effects that a number expresses
+    for effect in effects:
+        added = {row: by for (field, row), by in (native(effect, space, values, model) or {}).items() if field == LOSS}
+        friction[list(added)] += list(added.values())
+        rigid |= {effect.name} if added else set()
+    damping = np.where(drives_joint(model), -model.actuator_biasprm[:, 2] * model.actuator_gear[:, 0] ** 2, 0.0)
+    damping[model.actuator_biastype != mujoco.mjtBias.mjBIAS_AFFINE] = 0.0
     for joint in scene.driven_joints:
         u, j, d = scene.command_names.index(joint), scene.id("joint", joint), scene.dof(joint)
         gear, bias = float(model.actuator_gear[u, 0]), model.actuator_biasprm[u]
@@ -177,11 +192,18 @@ def _drives(scene: Scene, model: mujoco.MjModel) -> list[dict[str, Any]]:
         ends += [np.abs(model.jnt_actfrcrange[j]).max()] if model.jnt_actfrclimited[j] else []
         out.append({
             "joint": joint, "unit": scene.torque_unit([joint]), "stiffness": -float(bias[1]) * gear**2,
-            "damping": abs(float(bias[2])) * gear**2, "viscous_friction": float(model.dof_damping[d]),
-            "friction": float(model.dof_frictionloss[d]), "armature": float(model.dof_armature[d]),
-            "effort_limit": float(min(ends)) if ends else None, "velocity_limit": None,
+            "damping": float(damping[drives_joint(model) & (model.actuator_trnid[:, 0] == j)].sum()),
+            "viscous_friction": float(model.dof_damping[d]), "friction": max(float(friction[d]), 0.0),
+            "armature": float(model.dof_armature[d]), "effort_limit": float(min(ends)) if ends else None,
+            "velocity_limit": None,
+            "left_out": sorted({t.effect for t in tables if joint in _joints_of(t) and t.effect not in rigid}),
         })  # fmt: skip
     return out
+
+
+def _joints_of(law: LawTable | NoTable) -> tuple[str, ...]:
+    """The joint on which a law acts; where it has no table, its location, which may be a joint."""
+    return (law.joint,) if isinstance(law, LawTable) else (law.location,)
 
 
 def with_numbers(scene: Scene, space: Space, values: np.ndarray) -> Any:

@@ -20,7 +20,7 @@ from small_gap import SCENE, demonstration, small_scene
 from droid_jax import runtime
 from droid_jax.identify import apply_fit
 from droid_jax.identify.gaussian import Gaussian, prior
-from droid_jax.identify.neutral_result import with_numbers, write_neutral
+from droid_jax.identify.neutral_result import neutral_json, with_numbers, write_neutral
 from droid_jax.model.effect_interface import Effect, State, complete
 from droid_jax.model.effects.registry import effect_space, joined, library, ready
 from droid_jax.model.fields import joint_damping
@@ -28,7 +28,7 @@ from droid_jax.model.law_tables import LawTable, NoTable, law_tables
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.physics import make_c_model, make_physics, theta_of
-from droid_jax.model.scene import Scene, load_scene
+from droid_jax.model.scene import Scene, compile_scene, load_scene
 from droid_jax.recordings.recording import TorqueConvention, TorqueSide
 from droid_jax.simulate.replay import make_drive, servo_replay
 from droid_jax.simulate.servo_gains import servo_factors
@@ -193,6 +193,24 @@ def test_drives_are_the_servos_at_their_joints(made: Made):
         assert drive["stiffness"] == pytest.approx(model.actuator_gainprm[u, 0] * model.actuator_gear[u, 0] ** 2)
         assert (drive["armature"], drive["friction"]) == (model.dof_armature[d], model.dof_frictionloss[d])
     assert [drive["joint"] for drive in made.fit["drives"]] == list(made.scene.driven_joints)
+    left_out = {drive["joint"]: drive["left_out"] for drive in made.fit["drives"]}
+    assert left_out["elbow"] == ["joint_directional", "load_friction"]
+    assert left_out["shoulder"] == ["joint_backlash", "joint_stribeck"]
+
+
+def test_drives_hold_constant_friction_of_effects_and_the_damping_of_all_actuators():
+    """A <velocity> beside the servo damps with a gear of its own; a limit that falls with speed is left out."""
+    scene = ready(compile_scene(mujoco.MjSpec.from_string("""<mujoco><worldbody><body>
+      <joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.2"/><geom size=".1" pos=".3 0 0"/></body></worldbody>
+      <actuator><position name="p" joint="j" kp="50" kv="1" gear="2"/><velocity name="d" joint="j" kv="2" gear="3"/>
+      </actuator></mujoco>"""), "damped"))  # fmt: skip
+    effects = library(scene, ["joint_coulomb", "torque_speed_line"])
+    space = effect_space(effects).select(["joint_coulomb[j]", "torque_speed_line[j]"])
+    values, gaussian = np.array([0.5, 0.1]), Gaussian(space, np.zeros(2), 0.01 * np.eye(2), "made up")
+    (drive,) = neutral_json(scene, gaussian, values, effects, None, "", {})["drives"]
+    assert (drive["stiffness"], drive["damping"]) == (50 * 2**2, 1 * 2**2 + 2 * 3**2)
+    assert (drive["friction"], drive["viscous_friction"]) == (pytest.approx(0.7), 0.3)
+    assert drive["left_out"] == ["torque_speed_line"]
 
 
 def test_laws_name_their_variables(made: Made):
