@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from droid_jax.recordings.recording import Channel
+
+LARGEST_DRIFT = 0.03  # s at the end of the log, if its samples were at --rate; a larger drift gives a warning
+SAME_RATE = 0.05  # largest relative difference at which --rate is taken to mean the rate of the stamps
 
 
 def common_clock(times: Sequence[np.ndarray], rate: float | None, places: Sequence[object]) -> np.ndarray:
@@ -36,6 +40,23 @@ def common_clock(times: Sequence[np.ndarray], rate: float | None, places: Sequen
     if high - low < 1:
         raise ValueError(f"the repeats have no common part: {', '.join(map(str, places))}")
     return step * np.arange(low, high + 1)
+
+
+def warn_of_rate(stamps: np.ndarray, rate: float | None, place: object) -> None:
+    """Warn where the stated rate differs slightly from that of the stamps [M] s: it may be a mistake.
+
+    A very different rate is that of a clock onto which the log is resampled.
+    """
+    if not rate or len(stamps) < 3:
+        return
+    own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
+    late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
+    if late > LARGEST_DRIFT and abs(own / rate - 1.0) < SAME_RATE:
+        warnings.warn(
+            f"{place}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "
+            f"resampled (by its number of samples it would be {late:.2g} s off at the end)",
+            stacklevel=3,
+        )
 
 
 def one_command(

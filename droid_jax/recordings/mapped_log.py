@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from droid_jax.arguments import shown
-from droid_jax.recordings.alignment import common_clock, one_command, start_positions
+from droid_jax.recordings.alignment import common_clock, one_command, start_positions, warn_of_rate
 from droid_jax.recordings.checks import UNITS, accept
 from droid_jax.recordings.clocks import SLACK, check_clock, in_gap, interpolate, resample
 from droid_jax.recordings.column_map import CHANNELS, ChannelMap, ColumnMap, TimeMap, as_list
@@ -66,6 +66,7 @@ def read_logs(
     repeats = [_read(opened, columns, allow_jitter) for opened in logs]
     places = [_first(opened, columns).where for opened in logs]
     if columns.rate is not None and stamped(columns):
+        warn_of_rate(_measured(repeats[0]).time, columns.rate, places[0])
         repeats = _on_one_clock(repeats, columns.rate, places)
     keys = [key for key in CHANNELS if key in repeats[0]]
     commands = [repeat["command"] for repeat in repeats] if "command" in keys else []
@@ -247,10 +248,14 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
     return len(one) == len(other) and bool(np.abs(one - other).max(initial=0.0) <= SLACK)
 
 
+def _measured(repeat: Mapping[str, _Series]) -> _Series:
+    """The first channel of a repeat that is no command."""
+    return next(series for key, series in repeat.items() if key != "command")
+
+
 def _on_one_clock(repeats: list[dict[str, _Series]], rate: float, places: Sequence[str]) -> list[dict[str, _Series]]:
     """All channels of all repeats, interpolated onto one uniform clock over the part that all repeats cover."""
-    measured = [next(s for key, s in repeat.items() if key != "command") for repeat in repeats]
-    clock = common_clock([s.time for s in measured], rate, places)
+    clock = common_clock([_measured(repeat).time for repeat in repeats], rate, places)
     out = []
     for repeat in repeats:
         series = {}
@@ -279,9 +284,10 @@ def _meta(places: Sequence[str], log: LogColumns, columns: ColumnMap) -> Mapping
     meta = {"logs": ", ".join(Path(place).name for place in places)[:1000], **log.notes}
     if columns.rate is not None and not stamped(columns):
         meta["rows"] = f"{columns.rate:g} Hz, by their number: the log was read without stamps"
+        own = f" (the log itself states {log.rate:g} Hz)" if log.rate not in (None, columns.rate) else ""
         warnings.warn(
-            f"{places[0]}: read without stamps, at the stated {columns.rate:g} Hz; a rate that is off by 1 % looks "
-            "like a delay that grows",
+            f"{places[0]}: read without stamps, at the stated {columns.rate:g} Hz{own}; a rate that is off by 1 % "
+            "looks like a delay that grows",
             stacklevel=3,
         )
     return meta

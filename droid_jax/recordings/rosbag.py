@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from droid_jax.recordings.alignment import common_clock, one_command, start_positions
+from droid_jax.recordings.alignment import common_clock, one_command, start_positions, warn_of_rate
 from droid_jax.recordings.bag_messages import FIELDS, GAINS, Wanted
 from droid_jax.recordings.bag_topics import Track, read_bag
 from droid_jax.recordings.checks import UNITS, validate
@@ -37,8 +37,6 @@ STATE, COMMAND = "state", "command"  # keys of the two topics that are read from
 UNUSED_SETPOINTS = (
     "unused_setpoints"  # in `meta`: kinds of set-points that the commands hold and the recording does not
 )
-LARGEST_DRIFT = 0.03  # s at the end of the log, if its samples were at --rate; a larger drift gives a warning
-SAME_RATE = 0.05  # largest relative difference at which --rate is taken to mean the rate of the stamps
 _Timed = tuple[np.ndarray, dict[str, np.ndarray]]  # stamps [M] s, and values [M, J] by field
 
 
@@ -112,7 +110,7 @@ def read_bags(
 
     channels = _channels(states, clock, joints, slides, torque is not None, bags)
     command, command_names = np.zeros((0, 0)), ()
-    _warn_of_rate(states[0][0], rate, bags[0])
+    warn_of_rate(states[0][0], rate, bags[0])
     unused = _unused(commands, command_topic, extra)
     if commands:
         command = _command(commands, clock, command_joints, command_tolerance, bags)
@@ -211,20 +209,6 @@ def _unused(commands: Sequence[_Timed], topic: str | None, extra: Mapping[str, t
             stacklevel=3,
         )
     return found
-
-
-def _warn_of_rate(stamps: np.ndarray, rate: float | None, bag: Path) -> None:
-    """Warn where the stated rate differs slightly from that of the stamps [M] s: it may be a mistake."""
-    if not rate or len(stamps) < 3:
-        return
-    own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
-    late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
-    if late > LARGEST_DRIFT and abs(own / rate - 1.0) < SAME_RATE:
-        warnings.warn(
-            f"{bag}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "
-            f"resampled (by its number of samples it would be {late:.2g} s off at the end)",
-            stacklevel=3,
-        )
 
 
 def _bags(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:

@@ -323,6 +323,19 @@ def test_a_rate_makes_one_clock_and_no_stamps_make_a_warning(tmp_path: Path):
     check(found, position=POSITION, velocity=VELOCITY, torque=TORQUE)
 
 
+def test_a_rate_that_the_stamps_do_not_have_is_said(tmp_path: Path):
+    """With both numbers, where it may be meant as theirs; half of it is a coarser clock."""
+    path = log(tmp_path / "a.csv")
+    with pytest.warns(
+        UserWarning, match=r"a\.csv: the stamps are at 100 Hz, not at the 97 Hz of --rate; they are used"
+    ):
+        load_recording(path, columns=whole(rate=97.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for rate in (50.0, 100.0):
+            load_recording(path, columns=whole(rate=rate))
+
+
 def test_seconds_and_nanoseconds_add_up(tmp_path: Path):
     whole_, part = np.divmod(np.round((TIME + 0.5) * 1e9).astype(int), 10**9)
     path = log(tmp_path / "a.csv", sec=whole_ + 1_700_000_000, nsec=part)
@@ -473,6 +486,10 @@ def test_hdf5_of_robomimic_chooses_a_demonstration(tmp_path: Path):
     assert found.channels["position"].time == pytest.approx(TIME)  # at the controller's rate
     assert found.channels["position"].values[0, :, 0] == pytest.approx(POSITION[:, 0] + 10)
     assert "no group 'data/demo_3'; it has: data" in refused(path, episodes=["data/demo_3"])
+    joints = [f"j{i}" for i in range(7)]
+    columns = ColumnMap(joints, position="obs/robot0_joint_pos", units=Units(angle="rad"), rate=97.0)
+    with pytest.warns(UserWarning, match=r"at the stated 97 Hz \(the log itself states 100 Hz\); a rate that is off"):
+        load_recording(path, columns=columns, episodes=["data/demo_0"])
     both = load_recording(path, episodes=["data/demo_0", "data/demo_1"])
     assert both.repeats == 2 and not both.command_names
     (tmp_path / "b.h5").write_bytes(b"\x89HDF broken")
