@@ -164,3 +164,5 @@ def test_documented_settings_are_the_defaults(config: type):
     numbers = {name: float(value) for name, value in rows.items() if re.fullmatch(r"[\d.e-]+", value)}
     assert len(numbers) > 3
     assert numbers == pytest.approx({name: getattr(config(), name) for name in numbers})
+    lists = {name: value.split(", ") for name, value in rows.items() if re.fullmatch(r"[\d.]+(, [\d.]+)+", value)}
+    assert {name: tuple(map(float, value)) for name, value in lists.items()} == {n: getattr(config(), n) for n in lists}

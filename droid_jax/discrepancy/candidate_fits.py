@@ -84,7 +84,7 @@ def proposals_after_one_step(
             problem.progress("one_step_fit", names_of((*model.keys, part.key)))
             raw = {found.directions[k].coefficient: found.raw[k] for k in rows_of(found, proposal.parts)}
             asked.append((part, raw, start))
-        ends = one_step_fits(problem.case.train, model, asked, config.one_step)
+        ends = one_step_fits(problem.case.train, model, asked, config)
         out += [(*end, proposal) for end, proposal in zip(ends, batch, strict=True)]
     return out, Notes()
 

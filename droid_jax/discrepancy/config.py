@@ -169,6 +169,8 @@ class DiscrepancyConfig:
         polish: refinement of the selected model, with slopes over the width of its posterior.  Its intervals are
             reported.
         one_step_fits: number of candidates that get one Levenberg-Marquardt step in each selection step.
+        one_step_shares: shares of the coefficients at which a candidate's sensitivity was taken.  Its step also begins
+            at the best of them, since an effect with a threshold may have no slope at neutral.
         full_refits: number of these that are refitted in full, the best first.
         sure_refits: number of full refits for the first candidates of the ranking, whatever their one-step fits
             reached.  One step may miss a strong effect.
@@ -201,6 +203,7 @@ class DiscrepancyConfig:
     )
     polish: RefineConfig = field(default_factory=lambda: RefineConfig(iterations=12, basin_hops=0))
     one_step_fits: int = 12
+    one_step_shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125)
     full_refits: int = 6
     sure_refits: int = 2
     pair_refits: int = 4
@@ -220,6 +223,7 @@ class DiscrepancyConfig:
             self,
             **dict.fromkeys(("one_step_fits", "full_refits", "pair_refits", "max_effects"), partial(whole, least=1)),
             sure_refits=partial(whole, least=0),
+            one_step_shares=several(partial(number, above=0, most=1)),
             **dict.fromkeys(("refine", "refit", "polish"), partial(instance, kind=RefineConfig)),
             search=partial(instance, kind=CmaConfig),
             one_step=partial(instance, kind=LevenbergMarquardtConfig),

@@ -18,14 +18,12 @@ from droid_jax.discrepancy.candidates import from_neutral, project
 from droid_jax.discrepancy.case import Case, ResidualSet
 from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.identify.fit import grip_hypotheses, search_cost, starts
-from droid_jax.identify.levenberg_marquardt import DampedProblem, LevenbergMarquardtConfig
+from droid_jax.identify.levenberg_marquardt import DampedProblem
 from droid_jax.identify.multistart import Hypotheses, Look, RefineConfig, Refined, RefineProgress, chords, refine
 from droid_jax.identify.pipeline import Progress
 from droid_jax.identify.search import NotReplayed, cma_search
 from droid_jax.model.effects.candidate import Candidate, Keys, keys_of, names_of
 from droid_jax.model.parameters import Space
-
-SHARES = (1.0, 0.5, 0.25, 0.125)  # of the coefficients of a sensitivity, at which an effect is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,27 +107,28 @@ def one_step_fits(
     residual_set: ResidualSet,
     model: FittedModel,
     asked: Sequence[tuple[Candidate, Mapping[str, np.ndarray], np.ndarray]],
-    config: LevenbergMarquardtConfig | None = None,
+    config: DiscrepancyConfig,
 ) -> list[tuple[np.ndarray, float]]:
     """Models with one more effect each, after one Levenberg-Marquardt step with known slopes, all in the same batches.
 
-    Each effect has three starts: its proposed coefficients, neutral, and the best of some shares of the coefficients at
-    which its sensitivity was taken (`_scanned`).  A step moves a parameter by at most two prior deviations, and the
-    coefficient of a strong effect may be larger.  An effect that begins at a threshold, such as a limit of torque, has
-    no slope at neutral and perhaps none at the proposal.  The best end is returned.
+    Each effect has three starts: its proposed coefficients, neutral, and the best of `one_step_shares` of the
+    coefficients at which its sensitivity was taken (`_scanned`).  A step moves a parameter by at most two prior
+    deviations, and the coefficient of a strong effect may be larger.  An effect that begins at a threshold, such as a
+    limit of torque, has no slope at neutral and perhaps none at the proposal.  The best end is returned.
 
     Args:
         residual_set: of the fitted recording.
         model: without the effects.
         asked: of each effect its candidate, coefficient -> sensitivity [M] at `model` in one repeat's noise, and values
             [D] of the model with the proposed coefficients.
-        config: of the steps.
+        config: settings of the search.
 
     Returns:
         Values [D] and objective of each effect's model.
     """
     whole = residual_set.cost.space
-    looks, scanned = list[Look](), _scanned(residual_set, model, [(part, start) for part, _, start in asked])
+    begun = [(part, start) for part, _, start in asked]
+    looks, scanned = list[Look](), _scanned(residual_set, model, begun, config.one_step_shares)
     for (part, sensitivities, proposed), tried in zip(asked, scanned, strict=True):
         space = whole.select(dict.fromkeys((*model.space.names, *part.free)))
         jacobian = np.zeros((model.refined.jacobian.shape[0], len(space)))
@@ -140,14 +139,17 @@ def one_step_fits(
         without[coefficients] = model.values[coefficients]
         starts = np.stack([without, proposed, tried])[:, whole.columns(space)]
         looks.append(Look(space, starts, jacobian, functools.partial(whole.embed, space, values=without)))
-    ends = chords(residual_set.whitened, looks, config)
+    ends = chords(residual_set.whitened, looks, config.one_step)
     return [(look.rows(values[None])[0], objective) for look, (values, objective) in zip(looks, ends, strict=True)]
 
 
 def _scanned(
-    residual_set: ResidualSet, model: FittedModel, asked: Sequence[tuple[Candidate, np.ndarray]]
+    residual_set: ResidualSet,
+    model: FittedModel,
+    asked: Sequence[tuple[Candidate, np.ndarray]],
+    shares: Sequence[float],
 ) -> list[np.ndarray]:
-    """Values [D] of each effect's model at one of SHARES of the coefficients at which its sensitivity was taken.
+    """Values [D] of each effect's model at one of `shares` of the coefficients at which its sensitivity was taken.
 
     It is the share that leaves least to the residual after the base parameters have absorbed their part of it.  All are
     replayed in one batch.
@@ -156,7 +158,7 @@ def _scanned(
     """
     whole, rows = residual_set.cost.space, list[np.ndarray]()
     for part, proposed in asked:
-        for share in SHARES:
+        for share in shares:
             row = proposed.copy()
             for name in part.coefficients:
                 neutral, at = whole[name].mean, whole.index(name)
@@ -164,8 +166,8 @@ def _scanned(
                 row[at] = neutral + share * math.copysign(step, proposed[at] - neutral or step)
             rows.append(np.clip(row, whole.low, whole.high))
     left = project(residual_set.whitened(np.stack(rows)), model.refined.jacobian, model.refined.prior)
-    squares = np.nan_to_num(np.sum(left**2, axis=1), nan=np.inf).reshape(len(asked), len(SHARES))
-    return [rows[len(SHARES) * k + int(best)] for k, best in enumerate(np.argmin(squares, axis=1))]
+    squares = np.nan_to_num(np.sum(left**2, axis=1), nan=np.inf).reshape(len(asked), len(shares))
+    return [rows[len(shares) * k + int(best)] for k, best in enumerate(np.argmin(squares, axis=1))]
 
 
 def base_fit(

@@ -15,7 +15,9 @@ from small_gap import PRELOAD, TRUTH, Small, problem_of, quiet, small
 
 from droid_jax.discrepancy import candidate_fits, fitting, search
 from droid_jax.discrepancy.candidate_fits import Notes, Problem
+from droid_jax.discrepancy.candidates import from_neutral
 from droid_jax.discrepancy.case import Case
+from droid_jax.discrepancy.config import DiscrepancyConfig
 from droid_jax.discrepancy.fitting import (
     FinalModel,
     FittedModel,
@@ -24,7 +26,7 @@ from droid_jax.discrepancy.fitting import (
     final_refit_due,
     fitted_from_prior,
 )
-from droid_jax.discrepancy.results import extended, write_amended, write_gap
+from droid_jax.discrepancy.results import extended, gap_json, write_amended, write_gap
 from droid_jax.discrepancy.search import SearchState, restart_from_prior, selection_step
 from droid_jax.discrepancy.selection import SelectionStep
 from droid_jax.files import GAP
@@ -47,6 +49,33 @@ def lost(found: Small) -> SelectionStep:
     _, info = selection_step(SearchState(found.base), problem_of(found))
     assert info is not None and info.selected is not None
     return replace(info, selected=None, chosen=None)
+
+
+@pytest.mark.parametrize("share", [0.7, 0.2])
+def test_the_shares_at_which_an_effect_is_tried_are_those_of_the_config(
+    found: Small, share: float, monkeypatch: pytest.MonkeyPatch
+):
+    """They are in the result too."""
+    looks: list[Any] = []
+
+    def kept(whitened: Any, asked: Any, config: Any) -> list[tuple[np.ndarray, float]]:
+        looks.extend(asked)
+        return [(look.starts[0], 0.0) for look in asked]
+
+    monkeypatch.setattr(fitting, "chords", kept)
+    case, space = (
+        replace(found.case, config=replace(found.case.config, one_step_shares=(share,))),
+        found.case.full_space,
+    )
+    (part,) = candidates(e for e in case.effects if e.name == "hinge_preload")
+    proposed, slopes = found.base.values.copy(), {"hinge_preload": np.zeros(len(found.base.refined.residual))}
+    proposed[space.index("hinge_preload")] = 0.1
+    fitting.one_step_fits(case.train, found.base, [(part, slopes, proposed)], case.config)
+    tried = looks[0].starts[2][looks[0].space.index("hinge_preload")]
+    assert tried == pytest.approx(share * from_neutral(space["hinge_preload"], case.config.selection.sensitivity_step))
+    assert gap_json(case, found.verdict)["config"]["one_step_shares"] == [share]
+    with pytest.raises(ValueError, match="one_step_shares, entry 0 must be"):
+        DiscrepancyConfig(one_step_shares=(0.0,))
 
 
 @pytest.mark.slow
