@@ -34,6 +34,7 @@ import numpy as np
 FORMAT, VERSION = "droid_jax fitted", 1
 TRIES, SWEEPS = 2000, 40  # rows drawn until one is inside the bounds; then sweeps of Gibbs sampling
 FIRST_TRIES = 20  # rows of the first block of these, which usually suffices
+SHARES = 50  # of the way to the fitted values, tried where such a draw has an inertia that no body can have
 SAME = 1e-9  # relative; mj_setConst reproduces a model's derived numbers up to rounding
 TINY_FRICTION = 1e-6  # N m: gives a joint the constraint row that a law of friction needs
 _AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -143,7 +144,7 @@ def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
     low, high = np.array([_box(p, physical) for p in parameters]).T
     variances, axes = np.linalg.eigh(cov)
     root = axes * np.sqrt(variances.clip(0.0))
-    out = np.empty((len(samples), len(mean)))
+    out, unchecked = np.empty((len(samples), len(mean))), list[int]()
     for i, sample in enumerate(samples):
         rng = np.random.default_rng([seed, sample])
         for tries in (FIRST_TRIES, TRIES - FIRST_TRIES):
@@ -155,14 +156,33 @@ def draws(fit: dict[str, Any], samples: Any, seed: int = 0) -> np.ndarray:
                 break
         else:
             out[i] = _gibbs(rng, mean, cov, low, high)
-    return np.stack([_physical(p, out[:, i], physical) for i, p in enumerate(parameters)], axis=1)
+            unchecked.append(i)
+    out = np.stack([_physical(p, out[:, i], physical) for i, p in enumerate(parameters)], axis=1)
+    for i in unchecked:
+        out[i] = _made_possible(fit, out[i])
+    return out
 
 
 def _possible(fit: dict[str, Any], x: np.ndarray, physical: bool) -> bool:
     """Whether some body can have the moments of a draw, which MuJoCo's compiler wants too."""
     if not any(row["field"] == "body_inertia" for row in fit["table"]):
         return True
-    values = {p["name"]: float(_physical(p, x[i], physical)) for i, p in enumerate(fit["parameters"])}
+    return _has_body(fit, [float(_physical(p, x[i], physical)) for i, p in enumerate(fit["parameters"])])
+
+
+def _made_possible(fit: dict[str, Any], row: np.ndarray) -> np.ndarray:
+    """A row of values; its moments move towards the fitted ones as far as needed for some body to have them."""
+    of_moments = {w["parameter"] for r in fit["table"] if r["field"] == "body_inertia" for w in r["writes"]}
+    fitted = np.array(
+        [p["value"] if p["name"] in of_moments else v for p, v in zip(fit["parameters"], row, strict=True)]
+    )
+    between = (fitted + share * (row - fitted) for share in np.linspace(1.0, 0.0, SHARES, endpoint=False))
+    return next((values for values in between if _has_body(fit, values.tolist())), fitted)
+
+
+def _has_body(fit: dict[str, Any], numbers: list[float]) -> bool:
+    """Whether some body can have the moments at these values, in the order of fit["parameters"]."""
+    values = dict(zip((p["name"] for p in fit["parameters"]), numbers, strict=True))
     moments: dict[Any, dict[int, float]] = {}
     for row in fit["table"]:
         if row["field"] == "body_inertia":

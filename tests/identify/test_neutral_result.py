@@ -467,6 +467,19 @@ def test_draws_are_inertias_that_a_body_can_have(tmp_path: Path):
     assert np.all(2 * found.max(axis=1) <= found.sum(axis=1) * (1 + 1e-5))
 
 
+def test_a_draw_that_no_try_made_possible_moves_towards_the_fit(tmp_path: Path):
+    """All rows have a moment that no body can have, and so has what Gibbs sampling gives."""
+    rod = ROD.replace("<joint ", '<inertial pos="0 0 .1" mass="1" diaginertia=".01 .008 .004"/><joint ', 1)
+    moment = {"field": "body_inertia", "element": "rod", "column": 0, "std": 0.002, "high": 0.1}
+    fit, _ = fit_of_rod(tmp_path, [moment, DAMPING], xml=rod)
+    fit["gaussian"]["mean"][0] = 20.0  # prior deviations: 0.05 kg m^2, where the other two moments allow 0.012
+    drawn = apply_fit.draws(fit, range(8))
+    assert np.all((drawn[:, 0] > 0.011) & (drawn[:, 0] <= 0.012 * (1 + 1e-5)))
+    assert np.std(drawn[:, 1]) > 0.03  # other parameters are drawn as before
+    for sample in range(2):  # the compiler takes them
+        apply_fit.apply(mujoco.MjSpec.from_file(str(tmp_path / "rod.xml")), fit, sample)
+
+
 def test_a_batch_finds_full_inertias_by_their_prefix(tmp_path: Path):
     fit, _ = fit_of_rod(tmp_path, [{"inertia": "rod", "std": 0.2}])
     house = mujoco.MjSpec()
