@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +93,24 @@ def test_a_scene_for_plain_c_alone_is_looked_at_too(tmp_path: Path, scene: Path)
     out = tmp_path / "check"
     assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(out)]) == 0
     assert ("scene", "note") in found(out) and "--engine mujoco" in (out / "check.json").read_text()
+
+
+def test_a_note_that_fails_is_a_finding_beside_the_others(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch):
+    wrong = {**measured(0.0)}
+    wrong["position"] = replace(wrong["position"], values=np.rad2deg(wrong["position"].values))
+    log = Recording(**{**vars(wave()), "channels": wrong})
+    path, out = save_recording(log, tmp_path / "wave.npz"), tmp_path / "check"
+
+    def failing(scene: Scene, recording: Recording) -> list[str]:
+        warnings.warn("a limit is odd", stacklevel=2)
+        raise ValueError("the gains cannot be compared")
+
+    monkeypatch.setattr("droid_jax.preflight.inspect_log.command_notes", failing)
+    assert main(["check", "--recording", str(path), "--scene", str(scene), "--out", str(out)]) == 0
+    findings = json.loads((out / "check.json").read_text())["recordings"][0]["findings"]
+    said = {f["sentence"]: f["severity"] for f in findings}
+    assert said["the gains cannot be compared"] == "certain" and said["a limit is odd"] == "likely"
+    assert ("units", "certain") in found(out) and "the gains cannot be compared" in (out / "check.html").read_text()
 
 
 PARAMETERS = [

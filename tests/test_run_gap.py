@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, sma
 
 from droid_jax.commands import gap
 from droid_jax.commands.synthetic import hidden_effects, record_synthetic
-from droid_jax.discrepancy import fitting, log_case, missing
+from droid_jax.discrepancy import fitting, log_case, missing, results
 from droid_jax.discrepancy.verdict import Experiment
 from droid_jax.door.scene import door_scene
 from droid_jax.model.effect_interface import Effect
@@ -561,6 +562,45 @@ def test_the_verdict_is_there_whatever_becomes_of_what_is_added_to_it(
 
     monkeypatch.setattr(missing, "search_effects", lambda *a: pytest.fail("this run is whole"))
     assert main(command) == 0
+
+
+def test_the_verdict_is_written_before_whole_motions_are_replayed(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Of commanded logs in windows.  Errors of the motions come into the file when they are known."""
+    model, events, stops = SimpleNamespace(values=None), list[str](), True
+    verdict = SimpleNamespace(sentence="", base=model)
+    made = SimpleNamespace(verdict=verdict, final=SimpleNamespace(model=model), states={})
+
+    def searched(split: Any, case: Any, roles: Any, checkpoints: Any, start: Any, board: Any, keep: Any) -> None:
+        keep(case, made, {})
+        keep(case, made, {})  # an amendment
+
+    def writing(out: Path, case: Any, verdict: Any, final: Any, described: dict[str, Any], states: Any) -> None:
+        events.append("written with errors" if "open_loop" in described else "written")
+
+    def errors(*arguments: Any) -> dict[str, Any]:
+        events.append("replayed")
+        if stops:
+            raise KeyboardInterrupt
+        return {}
+
+    for name in ("train", "validation"):
+        save_recording(record(name).repeats_subset(range(5)), place / f"{name}.npz")
+    monkeypatch.setattr(log_case, "case_of", lambda *a: SimpleNamespace(limits=()))
+    monkeypatch.setattr(log_case, "open_loop_errors", errors)
+    monkeypatch.setattr(gap, "searched", searched)
+    monkeypatch.setattr(gap, "_done", lambda out: None)
+    for name in ("write_gap", "write_amended"):
+        monkeypatch.setattr(results, name, writing)
+    for stops, expected in (
+        (True, ["written", "replayed"]),
+        (False, ["written", "replayed", "written with errors", "replayed", "written with errors"]),
+    ):
+        events.clear()
+        assert main(arguments(place, "--again")) == (130 if stops else 0)
+        assert events == expected
+        assert ("the verdict is in" in capsys.readouterr().out) == stops
 
 
 @pytest.mark.slow

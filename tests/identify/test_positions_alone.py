@@ -12,6 +12,7 @@ import pendulum as made
 import pytest
 from pendulum import MJCF, PARAMETERS, RATE, START, TRUE, pendulum, swung, write_pendulum
 
+from droid_jax.commands.fitted import fitted_folder
 from droid_jax.cost.channels import in_noise_units
 from droid_jax.cost.cost import make_cost
 from droid_jax.cost.residuals import CompareConfig
@@ -110,6 +111,34 @@ def test_a_scene_that_changed_since_the_fit_is_noticed(
         scene.write_text(text)
     assert main([*words[:2], str(logs.folder), *words[3:]]) == 2
     assert "holds no finished fit" in capsys.readouterr().err
+
+
+def test_a_fit_without_its_nuisances_is_evaluated(logs: SimpleNamespace, tmp_path: Path, one_line: None):
+    """The scene was compiled for the friction of a nuisance that was not fitted."""
+    friction = {"field": "dof_frictionloss", "element": "swing", "mean": 0.01, "std": 0.01, "high": 0.1}
+    listed = [*PARAMETERS, friction | {"nuisance": True}]
+    (tmp_path / "parameters.json").write_text(json.dumps(listed))
+    words = [*logs.options[:2], "--parameters", str(tmp_path / "parameters.json"), "--recording", str(logs.soft)]
+    few = ["--no-nuisances", "--engine", "mujoco", "--generations", "1", "--population", "4"]
+    assert main(["identify", *words, *few, "--out", str(tmp_path / "fit")]) == 0
+    evaluate = ["evaluate-fit", "--fit", str(tmp_path / "fit"), "--recording", str(logs.judge)]
+    assert main([*evaluate, "--out", str(tmp_path / "evaluation")]) == 0
+    errors = json.loads((tmp_path / "evaluation" / "evaluation.json").read_text())["errors"]["judge"]["position"]
+    assert errors["mae_after"][0] < 0.3 * errors["mae_before"][0]
+
+
+def test_an_extended_model_of_other_recordings_is_no_part_of_a_fit(tmp_path: Path):
+    """The folder of `all` may hold a search of an earlier run."""
+    for stage, last in (("identify", "fit.json"), ("gap", "gap.json")):
+        (tmp_path / stage).mkdir()
+        for name in (last, "config.json"):
+            (tmp_path / stage / name).write_text("{}")
+        (tmp_path / stage / "setup.json").write_text(json.dumps({"recordings_sha256": ["a"], "scene_sha256": "s"}))
+    assert fitted_folder(tmp_path) == ("gap", tmp_path / "gap")
+    for stale in ({"recordings_sha256": ["b"]}, {"scene_sha256": "t"}):
+        search = {"recordings_sha256": ["a"], "scene_sha256": "s"} | stale
+        (tmp_path / "gap" / "setup.json").write_text(json.dumps(search))
+        assert fitted_folder(tmp_path) == ("identify", tmp_path / "identify")
 
 
 def test_several_channels_count_in_units_of_their_noise(logs: SimpleNamespace):

@@ -5,19 +5,23 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from droid_jax.cost.cost import make_cost
+from droid_jax.model.effect_interface import State
+from droid_jax.model.effects.registry import effect_space, library
 from droid_jax.model.encoders import encoder_error
 from droid_jax.model.fields import joint_encoder_offset
 from droid_jax.model.mjcf import fitted_mjcf, unwritten
 from droid_jax.model.parameter_file import load_parameters
 from droid_jax.model.parameters import Space
-from droid_jax.model.physics import make_c_model
+from droid_jax.model.physics import make_c_model, make_physics
 from droid_jax.model.scene import Scene, compile_scene
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
 
@@ -73,6 +77,26 @@ def test_the_robot_is_the_same_at_readings_lower_by_the_offset(reading: float):
     written = mujoco.MjModel.from_xml_string(fitted_mjcf(scene, space, np.array([OFF])))
     np.testing.assert_allclose(forces(written, read), expected, rtol=1e-4, atol=1e-4)
     assert unwritten(scene, space) == ()
+
+
+@pytest.mark.parametrize("name", ["payload", "free_payload"])
+def test_a_load_beside_an_offset_hangs_at_the_true_positions(name: str):
+    """Its torques at lower readings of the moved model are those of the plain model at the true positions."""
+    scene = scene_of()
+    (load,) = library(scene, [name])
+    elbow = joint_encoder_offset(scene, "elbow", std=0.02, high=0.1)
+    space = Space((elbow,)) + effect_space([load])
+    values = space.values({elbow.name: OFF, **{p.name: 0.1 for p in load.parameters if "moment" in p.name}})
+    physics, read = make_physics(scene, space, jnp.asarray(values, jnp.float32)), np.array([0.3, -0.4, 0.05])
+    assert load.force is not None
+
+    def torques(qpos: np.ndarray, model: Any) -> np.ndarray:
+        state = State(jnp.float32(0), jnp.asarray(qpos, jnp.float32), jnp.zeros(3), jnp.zeros(3), model)
+        return np.asarray(load.force(physics.theta, state))
+
+    expected = torques(np.add(read, [0.0, OFF, 0.0]), scene.mjx)
+    np.testing.assert_allclose(torques(read, physics.model), expected, rtol=1e-4, atol=1e-5)
+    assert np.abs(expected - torques(read, scene.mjx)).max() > 1e-2
 
 
 def test_a_file_states_it_as_a_sensors_term(tmp_path: Path):

@@ -496,6 +496,19 @@ def test_hdf5_of_robomimic_chooses_a_demonstration(tmp_path: Path):
     assert "not a readable HDF5 file" in refused(tmp_path / "b.h5")
 
 
+def test_hdf5_with_a_dataset_that_has_the_name_of_robomimics_group(tmp_path: Path):
+    """`data` holds the positions themselves, and neither demonstrations nor a control rate."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["data"], file["t"] = POSITION, TIME
+        file["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": 7}})
+    columns = ColumnMap(list(JOINTS), position="data", units=Units(angle="rad"), time="t")
+    found = load_recording(tmp_path / "a.h5", columns=columns)
+    assert found.channels["position"].time == pytest.approx(TIME)
+    assert found.channels["position"].values[0] == pytest.approx(POSITION)
+    assert "nor the rate of its rows" in refused(tmp_path / "a.h5", msgspec.structs.replace(columns, time=None))
+
+
 def test_torch_save_of_pace(monkeypatch: pytest.MonkeyPatch):
     """data/chirp_data.pt was written by torch 1.13 with PACE's keys; torch is not needed to read it."""
     monkeypatch.setitem(sys.modules, "torch", None)
