@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, wrap
+from jax.sharding import SingleDeviceSharding
 
 from droid_jax.policy.randomise import Randomise
 
@@ -39,7 +40,8 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
         use = next(uses)
         used = 1 if use else devices  # evaluations use one, so that their draws do not depend on the machine
         drawn = RandomisedEnvs(env, randomise, count, used, jax.random.fold_in(jax.random.PRNGKey(seed), use))
-        return AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
+        each = AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
+        return Committed(each) if use else each
 
     return wrap_env
 
@@ -85,6 +87,18 @@ class RandomisedEnvs(Wrapper):
             yield env
         finally:
             env.sys = before
+
+
+class Committed(Wrapper):
+    """Environments of brax's evaluations whose first state is committed to a device, as their last ones are.
+
+    brax passes the last state of an evaluation to the next one.  If only one of them were committed, the evaluation
+    would be compiled twice.
+    """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Reset all environments; rng: a key for each."""
+        return jax.lax.with_sharding_constraint(self.env.reset(rng), SingleDeviceSharding(jax.local_devices()[0]))
 
 
 def device_index() -> jax.Array:

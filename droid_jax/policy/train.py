@@ -33,7 +33,7 @@ from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import LAYOUT, Policy
 from droid_jax.policy.environment import Environment
 from droid_jax.policy.network import layer_sizes, policy_of
-from droid_jax.policy.parallel import wrapped
+from droid_jax.policy.parallel import AXIS, wrapped
 from droid_jax.policy.randomise import Randomise
 
 
@@ -56,6 +56,8 @@ class TrainConfig:
         batch: unrolls of a minibatch.
         minibatches: number of minibatches.
         epochs: number of updates with each minibatch.
+        episode: largest number of actions of an episode in training and its evaluations, where the task allows more;
+            None: the task's.  Trials of the policy last as long as the task allows.
         evaluations: number of evaluations (each saves a checkpoint) during the training.
         eval_envs: episodes of an evaluation.
         enough: success rate that ends the training,
@@ -80,6 +82,7 @@ class TrainConfig:
     batch: int = 32
     minibatches: int = 8
     epochs: int = 6
+    episode: int | None = 256
     evaluations: int = 16
     eval_envs: int = 128
     enough: float = 0.98
@@ -94,6 +97,7 @@ class TrainConfig:
             **dict.fromkeys(("learning_rate", "clip", "reward_scaling"), partial(number, above=0)),
             **dict.fromkeys(("discount", "gae"), partial(number, least=0, most=1)),
             devices=optional(partial(whole, least=1)),
+            episode=optional(partial(whole, least=1)),
             hidden=several(partial(whole, least=1)),
             entropy=partial(number, least=0),
             enough=partial(number, above=0, most=1),
@@ -109,8 +113,10 @@ class TrainConfig:
 
 PRESETS = {
     "quick": TrainConfig(),
-    "paper": TrainConfig(steps=20_000_000, batch=64, evaluations=40, eval_envs=128),
-    "gpu": TrainConfig(steps=40_000_000, envs=4096, batch=512, minibatches=8, evaluations=40, eval_envs=512),
+    "paper": TrainConfig(steps=20_000_000, batch=64, episode=None, evaluations=40, eval_envs=128),
+    "gpu": TrainConfig(
+        steps=40_000_000, envs=4096, batch=512, minibatches=8, episode=None, evaluations=40, eval_envs=512
+    ),
 }
 
 
@@ -292,7 +298,7 @@ def _ppo(
         environment=env,
         num_timesteps=steps,
         num_envs=config.envs,
-        episode_length=env.task.steps,
+        episode_length=min(env.task.steps, config.episode or env.task.steps),
         learning_rate=config.learning_rate,
         entropy_cost=config.entropy,
         discounting=config.discount,
@@ -385,30 +391,37 @@ def from_tree(blank: Any, tree: dict[str, Any]) -> Any:
 
 
 _NAMES = ("normaliser", "actor", "critic")
+_REPLICATED = "device_put_replicated"
 
 
 class replicated:
-    """Provide jax.device_put_replicated, which jax 0.10 removed and brax 0.14.2 calls once.
+    """Provide jax.device_put_replicated, which brax 0.14.2 calls once, as `put_replicated`.
 
-    The replacement also adds a leading axis over the devices.  Nothing is changed if jax has the function.
+    jax 0.10 removed it.  That of jax 0.9 places its copies unlike the results of brax's programs, so brax's evaluation
+    would be compiled twice, for networks before and after the first update.
     """
 
     def __init__(self, module: Any = jax) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns when the attribute is looked up
-            self._module, self._missing = module, not hasattr(module, "device_put_replicated")
+        self._module = module
 
     def __enter__(self) -> None:
-        if self._missing:
-            self._module.device_put_replicated = put_replicated
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns when the attribute is looked up
+            self._own = getattr(self._module, _REPLICATED, None)
+        setattr(self._module, _REPLICATED, put_replicated)
 
     def __exit__(self, *_: object) -> None:
-        if self._missing:
-            del self._module.device_put_replicated
+        if self._own is None:
+            delattr(self._module, _REPLICATED)
+        else:
+            setattr(self._module, _REPLICATED, self._own)
 
 
 def put_replicated(tree: Any, devices: Any) -> Any:
-    """A copy of every array on every device, [devices, ...], as jax.pmap needs it."""
-    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
-    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
-    return jax.tree.map(lambda a: jax.device_put(jnp.stack([jnp.asarray(a)] * len(devices)), sharding), tree)
+    """A copy of every array on every device, [devices, ...], with the type and the place of a result of brax's pmap."""
+
+    def one(_: Any, copied: Any) -> Any:
+        # Results have no weak types.
+        return jax.tree.map(lambda a: jax.lax.convert_element_type(a, jnp.result_type(a)), copied)
+
+    return jax.pmap(one, axis_name=AXIS, in_axes=(0, None), devices=devices)(np.arange(len(devices)), tree)

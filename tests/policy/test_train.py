@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -46,13 +47,23 @@ def test_the_replacement_of_braxs_missing_function_puts_a_copy_on_every_device()
     np.testing.assert_array_equal(doubled, 2 * np.tile(np.arange(3.0), (len(devices), 1)))
 
 
+def test_networks_before_and_after_an_update_share_a_compiled_evaluation():
+    devices, traces = jax.local_devices(), list[int]()
+    before = put_replicated({"kernel": np.ones((2, 3), np.float32), "scale": jnp.asarray(1.0)}, devices)
+    after = jax.pmap(lambda tree: jax.tree.map(lambda a: 2.0 * a, tree), axis_name="i", devices=devices)(before)
+    evaluate = jax.jit(lambda tree: traces.append(1) or tree)
+    for tree in (before, after):
+        evaluate(jax.tree.map(lambda a: a[0], tree))
+    assert len(traces) == 1
+
+
 def test_jax_is_restored():
     new, old = SimpleNamespace(), SimpleNamespace(device_put_replicated="its own")
     with replicated(new):
         assert new.device_put_replicated is put_replicated
     assert not hasattr(new, "device_put_replicated")
     with replicated(old):
-        assert old.device_put_replicated == "its own"
+        assert old.device_put_replicated is put_replicated
     assert old.device_put_replicated == "its own"
 
 
@@ -238,10 +249,12 @@ def test_training_continues_from_the_last_valid_checkpoint(monkeypatch, tmp_path
 
 
 @pytest.mark.slow
-def test_a_short_run_is_saved_and_continues(tmp_path: Path):
+def test_a_short_run_is_saved_and_continues(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     scene = door_scene(timestep=0.004, limits=True)
     env, randomise = DoorEnv(scene, Task(steps=20)), randomised(scene, prior(door_space(scene)))
-    first = train(env, randomise, SHORT, checkpoints=tmp_path)
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        first = train(env, randomise, SHORT, checkpoints=tmp_path)
+    assert caplog.text.count("Compiling jit(generate_eval_unroll)") == 1  # for three evaluations
     assert [now.step for now in first.history] == [0, 512, 1024]
     assert first.policy.mean.shape == (OBSERVED,) and np.abs(first.policy.mean).max() > 0.1
     assert all(0.0 <= now.success <= 1.0 and np.isfinite(now.reward) for now in first.history)
