@@ -26,7 +26,7 @@ from droid_jax.recordings.formats import load_recording
 from droid_jax.simulate.batching import over_block, over_population
 from droid_jax.simulate.c_engine import instrument, simulate
 from droid_jax.simulate.c_reference import control_of
-from droid_jax.simulate.compiled import batch_replay
+from droid_jax.simulate.compiled import LONG, batch_replay
 from droid_jax.simulate.replay import Drive, make_drive, servo_replay
 
 C_CHUNK = 64  # samples of which the C engine holds traces at once
@@ -71,7 +71,8 @@ def padded(values: np.ndarray, multiple: int) -> np.ndarray:
 def in_blocks(case: Case) -> Callable[[np.ndarray], Any]:
     """The replay as a search runs it: [P, D] -> Rollout on the host, in the program's own blocks."""
     replay = servo_replay(case.scene, case.drive)
-    return over_population(lambda values: replay(make_physics(case.scene, case.space, values)))
+    long = case.steps >= LONG
+    return over_population(lambda values: replay(make_physics(case.scene, case.space, values)), long)
 
 
 def as_one_block(case: Case, population: int) -> Run:

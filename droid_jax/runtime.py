@@ -14,6 +14,7 @@ import contextlib
 import functools
 import gc
 import hashlib
+import importlib
 import importlib.metadata
 import math
 import os
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -45,6 +47,8 @@ GARBAGE_THRESHOLDS = (50_000, 10, 10)
 PRODUCTS = "highest"
 CACHE_VARIABLE = "DROID_JAX_CACHE"
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "brax", "numpy", "scipy")
+_NAME = b"xla_cpu_small_while_loop_byte_threshold"
+_LOOP_KERNELS: ContextVar[bool] = ContextVar("loop kernels", default=False)
 _EMITTERS_OFF = f"--{EMITTERS}=false"
 _DEVICE_COUNT = "--xla_force_host_platform_device_count="
 
@@ -132,6 +136,72 @@ def compiler_options() -> dict[str, bool]:
     if jax.default_backend() != "cpu" or not _option_known():
         return {}
     return {EMITTERS: False}
+
+
+def with_loop_kernels(function: Function) -> Function:
+    """The function, which runs a compiled program; on a CPU each of the program's loops becomes one kernel.
+
+    A program that XLA cannot compile in this way, or a version of jax without this option, is compiled as usual.
+    """
+    refused = False
+
+    @functools.wraps(function)
+    def run(*given: Any) -> Any:
+        nonlocal refused
+        import jax
+
+        if refused or jax.default_backend() != "cpu" or not _loop_kernels_known():
+            return function(*given)
+        token = _LOOP_KERNELS.set(True)
+        try:
+            return function(*given)
+        except jax.errors.JaxRuntimeError as error:
+            if "UNIMPLEMENTED" not in str(error):
+                raise
+            refused = True
+        finally:
+            _LOOP_KERNELS.reset(token)
+        return function(*given)
+
+    return cast(Function, run)
+
+
+@functools.cache
+def _loop_kernels_known() -> bool:
+    """Whether jax's compile options could be extended; if so, they are inside `with_loop_kernels` from now on.
+
+    XLA reads the bound from a map of its options, which jax can neither set by `compiler_options` nor by name.  So an
+    entry is appended to the serialised message; protocol buffers merge it.
+    """
+    try:
+        compiler: Any = importlib.import_module("jax._src.compiler")
+        of_jax = compiler.get_compile_options
+
+        def extended(options: Any) -> Any:
+            return type(options).ParseFromString(options.SerializeAsString() + _ENTRY)
+
+        known = _NAME in extended(of_jax(num_replicas=1, num_partitions=1)).SerializeAsString()
+    except (ImportError, AttributeError, TypeError, ValueError, RuntimeError):  # another version of jax
+        return False
+
+    @functools.wraps(of_jax)
+    def options(*given: Any, **named: Any) -> Any:
+        made = of_jax(*given, **named)
+        return extended(made) if _LOOP_KERNELS.get() else made
+
+    if known:
+        compiler.get_compile_options = options
+    return known
+
+
+def _message(field: int, content: bytes) -> bytes:
+    """A field of a protocol buffer that holds bytes, text or a message of fewer than 128 bytes."""
+    tag = field << 3 | 2
+    return bytes([tag & 127 | 128, tag >> 7] if tag > 127 else [tag]) + bytes([len(content)]) + content
+
+
+# CompileOptionsProto.executable_build_options.debug_options.xla_backend_extra_options[_NAME], bytes
+_ENTRY = _message(3, _message(3, _message(500, _message(1, _NAME) + _message(2, b"4000000000"))))
 
 
 def devices_mesh() -> Mesh:

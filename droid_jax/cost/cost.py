@@ -205,6 +205,7 @@ def make_cost(
     config: CompareConfig | None = None,
     effects: Sequence[Effect] = (),
     check: bool = True,
+    few: bool = False,
 ) -> Cost:
     """Return the cost of a scene over one or more recordings: equation 1 of the paper.
 
@@ -220,6 +221,7 @@ def make_cost(
             friction behind the sensor where the space holds any, are built in. Effects that raise the dry friction of a
             joint need `registry.ready(scene)`.
         check: warn of implausible units, signs and clocks in the recordings (`preflight.check_log`).
+        few: whether a few vectors will be replayed in all. MJX then compiles sooner and replays more slowly.
 
     Returns:
         A cost. Called with physical values [P, D], it returns [P] N m.
@@ -247,7 +249,8 @@ def make_cost(
     elif engine == "mjx":
         check_friction_rows(scene, space, effects)
     replays = tuple(
-        compiled_replay(engine, own, space, d, effects, config.mj_step) for own, d in zip(scenes, drives, strict=True)
+        compiled_replay(engine, own, space, d, effects, config.mj_step, few)
+        for own, d in zip(scenes, drives, strict=True)
     )
     comparisons = tuple(
         _compared(own, space, recording, drive, replay, config)

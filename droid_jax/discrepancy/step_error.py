@@ -36,7 +36,7 @@ def with_finer_step(residual_set: ResidualSet, base: Space, recording: Recording
     if isinstance(cost, WindowedLog):
         return cost.finer(scene, base)
     compared = until(recording, cost.drives[0])
-    return make_cost(scene, base, [compared], config=residual_set.comparison.config, check=False)
+    return make_cost(scene, base, [compared], config=residual_set.comparison.config, check=False, few=True)
 
 
 def until(recording: Recording, drive: Drive) -> Recording:

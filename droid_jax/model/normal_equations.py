@@ -3,9 +3,10 @@
     of_weights, solved = normal_equations(jacobian)
     change = solved(inertia + of_weights(curvature), pull)
 
-On a CPU the products of a row's entries are computed once a step and packed, and LAPACK factors the matrix.  A GPU
-computes each product faster than it reads it.  For matrices of eight rows, fused arithmetic is faster there than
-batched library calls (NVIDIA H200, door: `benchmarks/results/gpu.json`).
+On a CPU the products of a row's entries are computed once a step and packed.  A GPU computes each product faster than
+it reads it.  Small matrices are factored by unrolled arithmetic.  On a GPU it is faster than batched library calls
+(NVIDIA H200, door: `benchmarks/results/gpu.json`).  On a CPU it is as fast as LAPACK, and XLA can compile a time loop
+without library calls into one kernel (`simulate.batching`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-UNROLLED = 12  # most unknowns that a GPU solves by unrolled arithmetic; the program's size grows with their cube
+UNROLLED = 12  # most unknowns that are solved by unrolled arithmetic; the program's size grows with their cube
 
 
 def normal_equations(
@@ -30,15 +31,21 @@ def normal_equations(
     A is symmetric and positive definite.
     """
     size = jacobian.shape[1]
+    solved = solver(size)
     if jax.default_backend() == "cpu":
         products = jnp.concatenate([jacobian[:, i:] * jacobian[:, i : i + 1] for i in range(size)], axis=1)
         entry = _packed_index(size)
-        return lambda weights: (weights @ products)[entry], by_cholesky
+        return lambda weights: (weights @ products)[entry], solved
 
     def of_weights(weights: jax.Array) -> jax.Array:
         return jnp.sum((weights[:, None] * jacobian)[:, :, None] * jacobian[:, None, :], axis=0)
 
-    return of_weights, unrolled if size <= UNROLLED else by_cholesky
+    return of_weights, solved
+
+
+def solver(size: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """(A [n, n], b [n]) -> x [n] with A x = b, for positive definite A of this size."""
+    return unrolled if size <= UNROLLED else by_cholesky
 
 
 def by_cholesky(matrix: jax.Array, right: jax.Array) -> jax.Array:

@@ -31,7 +31,7 @@ from droid_jax.model.mjx_internals import (
     midpoint_constraints,
     with_constraint_force,
 )
-from droid_jax.model.normal_equations import normal_equations
+from droid_jax.model.normal_equations import normal_equations, solver
 from droid_jax.model.unsupported_features import check_options
 from droid_jax.quiet import mjx
 
@@ -85,7 +85,7 @@ def simulate_step(
         slope = mjx.deriv_smooth_vel(model, data)
         inertia = inertia if slope is None else inertia - 0.5 * model.opt.timestep * slope
     if constraint_rows(data).jacobian.size == 0:
-        data = data.replace(qacc=jax.scipy.linalg.solve(inertia, data.qfrc_smooth, assume_a="pos"))
+        data = data.replace(qacc=solver(model.nv)(inertia, data.qfrc_smooth))
     elif model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         data = mjx.solve(model, data)
     else:

@@ -1,13 +1,17 @@
 """Compile a function of one parameter vector for batches sharded over all devices; a time loop that is cheap to batch.
 
-Rows are processed in blocks of one fixed size (on a CPU one of two).  So a program compiles once for any number of
-rows.  `jax.shard_map` splits a block over the devices.  Only the functions that are wrapped here are sharded; search
-and statistics run on one device.  In a run of several processes each process computes a part of the rows
-(`distributed`).
+Rows are processed in blocks of one fixed size.  So a program compiles once for any number of rows.  `jax.shard_map`
+splits a block over the devices.  Only the functions that are wrapped here are sharded; search and statistics run on one
+device.  In a run of several processes each process computes a part of the rows (`distributed`).
 
 `jax.vmap` of a loop over time steps traces the loop's body and batches it repeatedly, until it knows which values
 differ by row.  `time_loop` batches the step inside the loop and treats the whole state as different by row.  So the
 step is traced twice and batched once.
+
+On a CPU XLA runs a loop's operations one by one, each as a kernel of its own, and a time step has hundreds.  With few
+rows, starting them takes half of the time.  XLA can also compile a whole loop into one kernel, which it does for loops
+that touch a kilobyte at most.  `over_block` raises that bound for long motions: a block of 32 doors is then replayed
+1.5 times as fast, and compiling takes 15 s longer.  Loops with library calls stay as they are.
 """
 
 from __future__ import annotations
@@ -25,49 +29,49 @@ from jax.sharding import PartitionSpec
 from droid_jax import distributed, runtime
 
 AXIS = "population"
-CPU_BLOCK = 32  # rows; blocks of 64 to 512 run 12 to 25 % faster, but smaller batches would be padded to them
+CPU_BLOCK = 32  # least rows; with a kernel for each operation larger blocks run 12 to 25 % faster
+DEVICE_ROWS = 16  # rows that a CPU device replays together in hardly more time than one: the length of its vectors
 MANY_BLOCK = 128  # rows, for batches that are always large: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
-LARGE_BLOCK = 256  # rows, if the batch is a multiple of it, as populations often are: a fifth faster
 GPU_BLOCK = 4096  # most rows of a block on an accelerator
 
 
 def block_size(rows: int, many: bool = False) -> int:
-    """Rows of a block: one of two sizes on a CPU, the next power of two up to GPU_BLOCK on an accelerator.
+    """Rows of a block: a fixed number on a CPU, the next power of two up to GPU_BLOCK on an accelerator.
 
     many: whether the batches of this program are always large (MANY_BLOCK in place of CPU_BLOCK).
     """
     power = 1 << max(5, (rows - 1).bit_length())
-    smallest = (MANY_BLOCK if many else CPU_BLOCK) if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
     devices = runtime.devices_mesh().size
+    on_cpu = max(MANY_BLOCK if many else CPU_BLOCK, DEVICE_ROWS * devices)
+    smallest = on_cpu if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
     return -(-smallest // devices) * devices
 
 
 def blocks(values: Any) -> Iterator[tuple[np.ndarray, int]]:
     """Yield [P, D] in blocks: (block [B, D], number of rows that are not padding).
 
-    The last block is padded with copies of its last row.  On a CPU blocks have LARGE_BLOCK rows if P is a multiple of
-    it.  So two programs serve every number of rows.
+    The last block is padded with copies of its last row.
 
     Raises ValueError for an array that is not [P, D] with P >= 1.
     """
     values = np.asarray(values)
     if values.ndim != 2 or len(values) == 0:
         raise ValueError(f"expected parameter vectors [P, D] with P >= 1, got shape {values.shape}")
-    exact = jax.default_backend() == "cpu" and len(values) % LARGE_BLOCK == 0
-    size = LARGE_BLOCK if exact and LARGE_BLOCK % runtime.devices_mesh().size == 0 else block_size(len(values))
+    size = block_size(len(values))
     for start in range(0, len(values), size):
         block = values[start : start + size]
         # Repeating a row keeps the padding inside the valid range.
         yield np.concatenate([block, np.repeat(block[-1:], size - len(block), axis=0)]), len(block)
 
 
-def over_block(function: Callable[..., Any], shared: bool = True) -> Callable[..., Any]:
+def over_block(function: Callable[..., Any], shared: bool = True, long: bool = False) -> Callable[..., Any]:
     """Compile `function` ([D], *more -> pytree) for whole blocks: [B, D], *more -> the same with a leading [B].
 
     B must be a multiple of the number of devices (see `block_size`).  `more` are pytrees of arrays and inputs of the
     program: other arrays of the same shapes do not compile it again.  The result stays on the devices, sharded by rows.
 
     shared: whether all rows share `more`; if not, its arrays have a leading [B].
+    long: whether on a CPU its loops are compiled into one kernel each, which takes longer to compile.
     """
     rows = PartitionSpec(AXIS)
 
@@ -80,12 +84,19 @@ def over_block(function: Callable[..., Any], shared: bool = True) -> Callable[..
         runtime.in_full(block), mesh=runtime.devices_mesh(), in_specs=specs, out_specs=rows, check_vma=False
     )
     compiled = jax.jit(mapped, compiler_options=runtime.compiler_options())
-    return lambda values, *more: compiled(jnp.asarray(values, jnp.float32), more)
+
+    def run(values: Any, *more: Any) -> Any:
+        return compiled(jnp.asarray(values, jnp.float32), more)
+
+    return runtime.with_loop_kernels(run) if long else run
 
 
-def over_population(function: Callable[[jax.Array], Any]) -> Callable[[Any], Any]:
-    """Compile `function` ([D] -> pytree) for any number of rows: [P, D] -> the same on the host, [P, ...]."""
-    compiled = over_block(function)
+def over_population(function: Callable[[jax.Array], Any], long: bool = False) -> Callable[[Any], Any]:
+    """Compile `function` ([D] -> pytree) for any number of rows: [P, D] -> the same on the host, [P, ...].
+
+    long: see `over_block`.
+    """
+    compiled = over_block(function, long=long)
     return lambda values: in_blocks(compiled, values)
 
 

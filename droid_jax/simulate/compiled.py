@@ -44,6 +44,7 @@ from droid_jax.simulate.replay import (
 from droid_jax.simulate.servo_gains import check_gains
 
 PROGRAMS = 16  # most programs of each kind in the cache; each holds its scene
+LONG = 1000  # steps of a motion from which a program's faster replays are worth a longer compilation
 MIN_ROWS = 8192  # least rows of a motion's program: 16 s at 2 ms
 
 Batch = Callable[[np.ndarray], Rollout]
@@ -113,7 +114,13 @@ def along_another(replay: Batch, follows: Drive | Motion) -> Batch:
 
 
 def compiled_replay(
-    engine: str, scene: Scene, space: Space, follows: Drive | Motion, effects: Sequence[Effect], mj_step: bool = False
+    engine: str,
+    scene: Scene,
+    space: Space,
+    follows: Drive | Motion,
+    effects: Sequence[Effect],
+    mj_step: bool = False,
+    few: bool = False,
 ) -> Batch:
     """A batch of replays of a drive or a measured motion: [B, D] -> Rollout [B, ...].
 
@@ -124,6 +131,8 @@ def compiled_replay(
         follows: the commands or the measured motion.
         effects: in the replay; those of the sensors are added (`with_sensors`).
         mj_step: step as the C engine does.
+        few: whether a few rows will be replayed in all.  The program of a long motion then compiles sooner and replays
+            more slowly.
 
     Raises:
         ValueError: a measured motion with mj_step, a replay that plain C does not support, gains for actuators that
@@ -144,7 +153,8 @@ def compiled_replay(
         return Along(batch, scene, space, follows, lambda paths: torques(means, paths))
     check_gains(scene, follows)
     if engine == "mjx":
-        program = _servo_program(scene, layout, effects, Clocked(follows.timestep, follows.torque, follows), mj_step)
+        clocked = Clocked(follows.timestep, follows.torque, follows)
+        program = _servo_program(scene, layout, effects, clocked, mj_step, len(follows.command) >= LONG and not few)
 
         def driven(drive: Drive) -> Batch:
             steps = len(drive.command)
@@ -263,11 +273,12 @@ def _servo_program(
     effects: tuple[Effect, ...],
     clocked: Clocked,
     mj_step: bool,
+    long: bool,
 ) -> Callable[..., Rollout]:
     """(values [B, D], *`traced_part` of a drive, steps) -> motion [B, T, ...], cached by identity of the scene."""
     motion = servo_motion(scene, clocked.drive, effects, parity=mj_step, late=0.0 if mj_step else 0.5)
     space = layout.space
-    return over_block(lambda values, *of_drive: motion(make_physics(scene, space, values), *of_drive))
+    return over_block(lambda values, *of_drive: motion(make_physics(scene, space, values), *of_drive), long=long)
 
 
 @functools.lru_cache(maxsize=PROGRAMS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from droid_jax import runtime
-from droid_jax.simulate.batching import LARGE_BLOCK, block_size, blocks, over_block, over_population
+from droid_jax.simulate.batching import block_size, blocks, over_block, over_population
 
 
 def function(v: jax.Array) -> dict[str, jax.Array]:
@@ -58,14 +58,6 @@ def test_blocks_cover_the_rows_once_and_repeat_the_last():
     np.testing.assert_array_equal(np.concatenate([b[:n] for b, n in pieces]), values)
     last, count = pieces[-1]
     assert (last[count:] == last[count - 1]).all()
-
-
-def test_large_blocks_are_used_for_multiples_of_their_size_and_give_the_same(batch):
-    values = np.random.default_rng(0).normal(size=(2 * LARGE_BLOCK, 5))
-    assert [len(block) for block, _ in blocks(values)] == [LARGE_BLOCK, LARGE_BLOCK]
-    assert {len(block) for block, _ in blocks(values[1:])} == {block_size(1)}
-    large, small = batch(values)["chain"], batch(values[1:])["chain"]
-    np.testing.assert_allclose(large[1:], small, rtol=1e-5)
 
 
 def test_programs_with_large_batches_have_larger_blocks_on_a_cpu():
