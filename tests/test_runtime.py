@@ -128,6 +128,39 @@ print(json.dumps(dict(hits=seen.count("/jax/compilation_cache/cache_hits"))))
     assert second.stderr == ""
 
 
+def test_a_loop_becomes_one_kernel_inside_with_loop_kernels():
+    def program(x: jax.Array) -> str:
+        def loop(x):
+            return jax.lax.fori_loop(0, 50, lambda i, y: jnp.sin(y) * 2.0 + y, x)
+
+        return jax.jit(loop).lower(x).compile().as_text()
+
+    large = jnp.ones((16, 64))  # XLA does the same by itself for a kilobyte
+    assert "xla_cpu_small_call" not in program(large)
+    assert "xla_cpu_small_call" in runtime.with_loop_kernels(program)(large)
+    assert "xla_cpu_small_call" not in program(large)
+
+
+def test_what_xla_cannot_compile_into_a_kernel_is_compiled_as_usual():
+    tried = list[bool]()
+
+    def run(number: int) -> int:
+        tried.append(runtime._LOOP_KERNELS.get())
+        if tried[-1]:
+            raise jax.errors.JaxRuntimeError("UNIMPLEMENTED: Fusion kind not implemented on CPU")
+        return number + 1
+
+    kernels = runtime.with_loop_kernels(run)
+    assert (kernels(1), kernels(2), tried) == (2, 3, [True, False, False])
+
+    def fail() -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
+        runtime.with_loop_kernels(fail)()
+    assert not runtime._LOOP_KERNELS.get()
+
+
 def test_an_unknown_flag_is_recognised_without_harm():
     assert runtime._probe_flag("--xla_no_such_flag_at_all=false") is False
 

@@ -74,7 +74,8 @@ class Options:
         """What a policy costs."""
         if self.trials < 1:
             raise SystemExit(f"error: --trials must be 1 or more, got {self.trials}")
-        preset = replace(PRESETS[self.preset], evaluations=self.evaluations, held=0)  # all cost alike
+        # All cost alike, and have the paper's episodes.
+        preset = replace(PRESETS[self.preset], evaluations=self.evaluations, held=0, episode=None)
         config = preset if self.steps is None else replace(preset, steps=self.steps)
         if not self.quick:
             return Budget(config, self.trials, self.again)
@@ -117,6 +118,8 @@ class Budget:
     def to_json(self) -> dict[str, Any]:
         """As plain data; the seed is each policy's own."""
         config = json.loads(json.dumps(asdict(replace(self.config, seed=0))))
+        if config["episode"] is None:  # earlier results lack the setting
+            del config["episode"]
         return {**config, "trials": self.trials, **({"again": self.again} if self.again else {})}
 
     def task(self, task: Task) -> Task:

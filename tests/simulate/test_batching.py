@@ -60,6 +60,15 @@ def test_blocks_cover_the_rows_once_and_repeat_the_last():
     assert (last[count:] == last[count - 1]).all()
 
 
+def test_a_program_of_long_motions_gives_the_same():
+    def motion(values):
+        return jax.lax.fori_loop(0, 50, lambda i, x: jnp.sin(x) * 2.0 + x, values)
+
+    values = np.random.default_rng(0).normal(size=(45, 40))
+    usual, long = over_population(motion)(values), over_population(motion, long=True)(values)
+    np.testing.assert_allclose(long, usual, rtol=1e-4, atol=1e-6)
+
+
 def test_programs_with_large_batches_have_larger_blocks_on_a_cpu():
     assert block_size(45) == block_size(4500) < block_size(45, many=True) == block_size(4500, many=True)
     assert block_size(45, many=True) % runtime.devices_mesh().size == 0
