@@ -30,7 +30,6 @@ from droid_jax import distributed, runtime
 
 AXIS = "population"
 CPU_BLOCK = 32  # least rows; with a kernel for each operation larger blocks run 12 to 25 % faster
-DEVICE_ROWS = 16  # rows that a CPU device replays together in hardly more time than one: the length of its vectors
 MANY_BLOCK = 128  # rows, for batches that are always large: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
 GPU_BLOCK = 4096  # most rows of a block on an accelerator
 
@@ -41,9 +40,8 @@ def block_size(rows: int, many: bool = False) -> int:
     many: whether the batches of this program are always large (MANY_BLOCK in place of CPU_BLOCK).
     """
     power = 1 << max(5, (rows - 1).bit_length())
+    smallest = (MANY_BLOCK if many else CPU_BLOCK) if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
     devices = runtime.devices_mesh().size
-    on_cpu = max(MANY_BLOCK if many else CPU_BLOCK, DEVICE_ROWS * devices)
-    smallest = on_cpu if jax.default_backend() == "cpu" else min(GPU_BLOCK, power)
     return -(-smallest // devices) * devices
 
 
