@@ -40,9 +40,10 @@ def torque_speed_line(scene: Scene) -> Effect | None:
         inverse, none = column(theta, LINE, servos.joints), jnp.array([-jnp.inf, jnp.inf])
         stall = 1.0 / jnp.maximum(inverse, LEAST)
         fall = a.value(theta, SLOPE) * jnp.asarray(usual, jnp.float32) * state.qvel[servos.dofs]
-        ends = jnp.stack([-stall - fall, stall - fall], axis=1) / servos.gear[:, None]
+        middle, half = -fall / servos.gear, stall / jnp.abs(servos.gear)
+        ends = jnp.stack([middle - half, middle + half], axis=1)  # a sort would keep the loop from one kernel
         every = jnp.tile(none, (len(state.model.actuator_gear), 1))
-        return every.at[servos.actuators].set(jnp.where(inverse[:, None] > 0.0, jnp.sort(ends, axis=1), none))
+        return every.at[servos.actuators].set(jnp.where(inverse[:, None] > 0.0, ends, none))
 
     of_joints = (
         a.coefficient(f"{LINE}[{joint}]", "1/(N m)", 6.0 / torque, 30.0 / torque, low=0.0)
