@@ -172,6 +172,32 @@ def test_each_function_changes_nothing_at_neutral(effect: Effect, scene: Scene):
             jax.tree.map(np.testing.assert_array_equal, effect.observe(theta, rollout), rollout)
 
 
+NO_KERNEL = {"sort", "lu", "eigh", "qr", "svd", "cholesky", "triangular_solve"}  # that XLA keeps out of a loop's kernel
+
+
+def primitives(jaxpr: Any) -> set[str]:
+    """Names of all operations of a jaxpr, those inside its loops and calls too."""
+    inside = (
+        [primitives(inner) for inner in jax.core.jaxprs_in_params(jaxpr.params)] if hasattr(jaxpr, "params") else []
+    )
+    if hasattr(jaxpr, "eqns"):
+        inside += [{eqn.primitive.name} | primitives(eqn) for eqn in jaxpr.eqns]
+    return set().union(*inside)
+
+
+def test_its_laws_in_a_time_step_need_no_library(effect: Effect, scene: Scene):
+    """A single sort or library call would slow the replays of every model with the effect by half."""
+    theta, state = {p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}, moments(scene)[0]
+    ctrl, loss = jnp.zeros(scene.model.nu), jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
+    for name, more in {"force": (), "frictionloss": (loss,), "servo": (ctrl,), "limits": ()}.items():
+        if law := getattr(effect, name):
+            made = jax.make_jaxpr(lambda s, law=law, more=more: law(theta, s, *more))(state)
+            assert not primitives(made.jaxpr) & NO_KERNEL, name
+    if effect.gear:
+        made = jax.make_jaxpr(lambda s: effect.gear.step(theta, s, ctrl))(state)
+        assert not primitives(made.jaxpr) & NO_KERNEL
+
+
 @pytest.mark.parametrize("effect", having("shape_parameters"), indirect=True)
 def test_a_missing_shape_parameter_has_its_mean(effect: Effect, scene: Scene):
     loud = {p.name: jnp.float32(typical(p)) for p in coefficients(effect)}
