@@ -17,6 +17,7 @@ from effect_oracles import OF_THEIR_OWN
 
 from droid_jax.model.effect_interface import LAWS, Effect, Rollout, State
 from droid_jax.model.effects.registry import library, registered
+from droid_jax.model.gravity import placed
 from droid_jax.model.parameters import Space
 from droid_jax.model.physics import DERIVED, Physics, make_physics, written_fields
 from droid_jax.model.scene import Scene
@@ -177,24 +178,21 @@ NO_KERNEL = {"sort", "lu", "eigh", "qr", "svd", "cholesky", "triangular_solve"} 
 
 def primitives(jaxpr: Any) -> set[str]:
     """Names of all operations of a jaxpr, those inside its loops and calls too."""
-    inside = (
-        [primitives(inner) for inner in jax.core.jaxprs_in_params(jaxpr.params)] if hasattr(jaxpr, "params") else []
-    )
-    if hasattr(jaxpr, "eqns"):
-        inside += [{eqn.primitive.name} | primitives(eqn) for eqn in jaxpr.eqns]
-    return set().union(*inside)
+    inner = (each for eqn in jaxpr.eqns for each in jax.core.jaxprs_in_params(eqn.params))
+    return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*map(primitives, inner))
 
 
 def test_its_laws_in_a_time_step_need_no_library(effect: Effect, scene: Scene):
     """A single sort or library call would slow the replays of every model with the effect by half."""
-    theta, state = {p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}, moments(scene)[0]
+    theta = {p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}
+    first = moments(scene)[0]
+    state = dataclasses.replace(first, pose=placed(scene.mjx, first.qpos))
     ctrl, loss = jnp.zeros(scene.model.nu), jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
-    for name, more in {"force": (), "frictionloss": (loss,), "servo": (ctrl,), "limits": ()}.items():
-        if law := getattr(effect, name):
-            made = jax.make_jaxpr(lambda s, law=law, more=more: law(theta, s, *more))(state)
-            assert not primitives(made.jaxpr) & NO_KERNEL, name
-    if effect.gear:
-        made = jax.make_jaxpr(lambda s: effect.gear.step(theta, s, ctrl))(state)
+    laws: dict[str, tuple[Any, ...]] = {"force": (), "frictionloss": (loss,), "servo": (ctrl,), "limits": ()}
+    within = [(getattr(effect, name), more) for name, more in laws.items() if getattr(effect, name)]
+    within += [(effect.gear.step, (ctrl,))] if effect.gear else []
+    for law, more in within:
+        made = jax.make_jaxpr(lambda s, law=law, more=more: law(theta, s, *more))(state)
         assert not primitives(made.jaxpr) & NO_KERNEL
 
 
