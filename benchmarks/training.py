@@ -73,13 +73,16 @@ class Arguments:
 
 def measured(arguments: Arguments) -> dict[str, Any]:
     """One training and its results; the policy is saved."""
-    often = PRESETS[arguments.preset].evaluations  # the preset as it is
-    asked = Options(quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=often)
+    preset = PRESETS[arguments.preset]  # with its own evaluations and episodes, which experiments share
+    asked = Options(
+        quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=preset.evaluations
+    )
     budget = asked.budget
     scene = door_scene(timestep=TIMESTEP, limits=True)
     began = time.perf_counter()
     env = DoorEnv(scene, budget.task(Task()))
-    gaussian, config = prior(door_space(scene) + door_nuisances(scene)), replace(budget.config, seed=arguments.seed)
+    gaussian = prior(door_space(scene) + door_nuisances(scene))
+    config = replace(budget.config, seed=arguments.seed, episode=preset.episode)
     doors = randomised(scene, gaussian)
     found = train(env, doors, config, progress=_tell)
     seconds = time.perf_counter() - began

@@ -139,7 +139,7 @@ def compiler_options() -> dict[str, bool]:
 
 
 def with_loop_kernels(function: Function) -> Function:
-    """The function, which runs a compiled program; on a CPU each of the program's loops becomes one kernel.
+    """The function, which runs a compiled program; on a CPU each of its loops without library calls is one kernel.
 
     A program that XLA cannot compile in this way, or a version of jax without this option, is compiled as usual.
     """

@@ -128,6 +128,7 @@ print(json.dumps(dict(hits=seen.count("/jax/compilation_cache/cache_hits"))))
     assert second.stderr == ""
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of loops are XLA's on a CPU")
 def test_a_loop_becomes_one_kernel_inside_with_loop_kernels():
     def program(x: jax.Array) -> str:
         def loop(x):
@@ -141,6 +142,7 @@ def test_a_loop_becomes_one_kernel_inside_with_loop_kernels():
     assert "xla_cpu_small_call" not in program(large)
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of loops are XLA's on a CPU")
 def test_what_xla_cannot_compile_into_a_kernel_is_compiled_as_usual():
     tried = list[bool]()
 

@@ -252,7 +252,9 @@ def _possible(
 
         def in_the_air() -> Experiment:
             alone, scene = replace(config, channels=channels), untouched(known.scene)
-            cost = make_cost(scene, case.full_space, [recording], config=alone, effects=case.effects, check=False)
+            cost = make_cost(
+                scene, case.full_space, [recording], config=alone, effects=case.effects, check=False, few=True
+            )
             return _experiment(IN_THE_AIR, cost, values, pairs)
 
         yield IN_THE_AIR, in_the_air

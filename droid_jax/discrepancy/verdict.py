@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -367,9 +367,15 @@ def _alternatives(part: EffectKey, model: FittedModel, steps: Sequence[Selection
     present, done = set(model.keys), _selecting(part, steps)
     if done is None:
         return ()
-    added, others = _added(done), [set(m.keys) - set(done.before) for m in done.indistinguishable]
-    instead = {tuple(sorted(o - added)) for o in others if part not in o and not (o - added) & present}
+    added, others = _added(done), [set(m.keys) - set(done.before) for m in _other_models(done, present)]
+    instead = {tuple(sorted(o - added)) for o in others if part not in o}
     return tuple(sorted(keys for keys in instead if keys))
+
+
+def _other_models(done: SelectionStep, present: Set[EffectKey]) -> list[FittedModel]:
+    """Models indistinguishable from the one that a step selected, without those whose effects a later step added."""
+    chosen = {*done.before, *_added(done)}
+    return [m for m in done.indistinguishable if not (set(m.keys) - chosen) & present]
 
 
 def _added(done: SelectionStep) -> set[EffectKey]:
@@ -392,7 +398,8 @@ def _indistinguishable_models(
     deciding = [_selecting(key, steps) for key in model.keys]
     groups = list[tuple[FittedModel, ...]]()
     for done in steps:
-        if done.selected is not None and done.indistinguishable and any(done is each for each in deciding):
+        others = _other_models(done, set(model.keys))
+        if done.selected is not None and others and any(done is each for each in deciding):
             chosen = model if set(model.keys) == set(done.selected.keys) else done.selected
-            groups.append((chosen, *done.indistinguishable))
+            groups.append((chosen, *others))
     return tuple(groups)

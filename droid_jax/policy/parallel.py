@@ -34,10 +34,11 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
     uses = itertools.count()
 
     def wrap_env(env: Env, episode_length: int, action_repeat: int, randomization_fn: Any) -> Env:
-        if randomise is None:
-            return wrap(env, episode_length, action_repeat)
-        count = len(randomization_fn.keywords["rng"])  # of environments on one device
         use = next(uses)
+        if randomise is None:
+            same = wrap(env, episode_length, action_repeat)
+            return Committed(same) if use else same
+        count = len(randomization_fn.keywords["rng"])  # of environments on one device
         used = 1 if use else devices  # evaluations use one, so that their draws do not depend on the machine
         drawn = RandomisedEnvs(env, randomise, count, used, jax.random.fold_in(jax.random.PRNGKey(seed), use))
         each = AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))

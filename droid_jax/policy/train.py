@@ -13,7 +13,6 @@ import contextlib
 import functools
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -405,9 +404,7 @@ class replicated:
         self._module = module
 
     def __enter__(self) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # jax 0.9 warns when the attribute is looked up
-            self._own = getattr(self._module, _REPLICATED, None)
+        self._own = vars(self._module).get(_REPLICATED)  # jax 0.9 has it in a function that warns of it
         setattr(self._module, _REPLICATED, put_replicated)
 
     def __exit__(self, *_: object) -> None:

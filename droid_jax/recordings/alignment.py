@@ -47,10 +47,12 @@ def warn_of_rate(stamps: np.ndarray, rate: float | None, place: object) -> None:
 
     A very different rate is that of a clock onto which the log is resampled.
     """
-    if not rate or len(stamps) < 3:
+    steps = np.diff(stamps)
+    steps = steps[steps > 0.0]
+    if not rate or len(steps) < 2:
         return
-    own = (len(stamps) - 1) / float(stamps[-1] - stamps[0])
-    late = abs((len(stamps) - 1) / rate - float(stamps[-1] - stamps[0]))
+    own = 1.0 / float(np.mean(steps[steps < 1.5 * np.median(steps)]))  # where no samples were lost
+    late = (len(stamps) - 1) * abs(1.0 / rate - 1.0 / own)
     if late > LARGEST_DRIFT and abs(own / rate - 1.0) < SAME_RATE:
         warnings.warn(
             f"{place}: the stamps are at {own:.5g} Hz, not at the {rate:g} Hz of --rate; they are used and the log is "

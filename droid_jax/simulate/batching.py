@@ -1,8 +1,8 @@
 """Compile a function of one parameter vector for batches sharded over all devices; a time loop that is cheap to batch.
 
-Rows are processed in blocks of one fixed size.  So a program compiles once for any number of rows.  `jax.shard_map`
-splits a block over the devices.  Only the functions that are wrapped here are sharded; search and statistics run on one
-device.  In a run of several processes each process computes a part of the rows (`distributed`).
+On a CPU rows are processed in blocks of one fixed size.  So a program compiles once for any number of rows.
+`jax.shard_map` splits a block over the devices.  Only the functions that are wrapped here are sharded; search and
+statistics run on one device.  In a run of several processes each process computes a part of the rows (`distributed`).
 
 `jax.vmap` of a loop over time steps traces the loop's body and batches it repeatedly, until it knows which values
 differ by row.  `time_loop` batches the step inside the loop and treats the whole state as different by row.  So the
@@ -11,7 +11,7 @@ step is traced twice and batched once.
 On a CPU XLA runs a loop's operations one by one, each as a kernel of its own, and a time step has hundreds.  With few
 rows, starting them takes half of the time.  XLA can also compile a whole loop into one kernel, which it does for loops
 that touch a kilobyte at most.  `over_block` raises that bound for long motions: a block of 32 doors is then replayed
-1.5 times as fast, and compiling takes 15 s longer.  Loops with library calls stay as they are.
+1.5 times as fast, and compiling takes 15 s longer.  Loops with library calls or a sort stay as they are.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jax.sharding import PartitionSpec
 from droid_jax import distributed, runtime
 
 AXIS = "population"
-CPU_BLOCK = 32  # least rows; with a kernel for each operation larger blocks run 12 to 25 % faster
+CPU_BLOCK = 32  # rows, up to a multiple of the devices; with a kernel for each operation 256 run a fifth faster
 MANY_BLOCK = 128  # rows, for batches that are always large: 24 windows of an arm's log ran 1.4 to 1.8 times as fast
 GPU_BLOCK = 4096  # most rows of a block on an accelerator
 

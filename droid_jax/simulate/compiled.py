@@ -2,8 +2,8 @@
 
 Compiling a replay takes longer than the replays of most fits.  A program depends on the scene, on the fields that a row
 of values writes, and on the effects.  Commands, their number, starts and measured motions are its inputs.  So
-recordings of any length, their held-out repeats and every search over them share one program.  The sensor model is a
-second, small program for each length of a motion.
+recordings of less than `LONG` steps, their held-out repeats and every search over them share one program, and so do
+those of more.  The sensor model is a second, small program for each length of a motion.
 """
 
 from __future__ import annotations

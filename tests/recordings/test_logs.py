@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from droid_jax.recordings import column_map
+from droid_jax.recordings.alignment import warn_of_rate
 from droid_jax.recordings.column_map import (
     ChannelMap,
     ColumnMap,
@@ -866,3 +867,11 @@ def test_the_maps_in_the_documentation_are_maps(tmp_path: Path):
     units = {unit for of in (HINGES, SLIDES) for kind in of.values() for unit in kind}
     stated = {word.strip() for part in row.split("|")[2].split(";") for word in part.partition(":")[2].split(",")}
     assert {word.partition(" (")[0] for word in stated} == units
+
+
+def test_lost_samples_are_no_other_rate(recwarn: pytest.WarningsRecorder):
+    every = np.arange(400) / 100.0
+    warn_of_rate(np.delete(every, slice(100, 112)), 100.0, "log.csv")
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="the stamps are at 100 Hz, not at the 98 Hz"):
+        warn_of_rate(np.delete(every, slice(100, 112)), 98.0, "log.csv")

@@ -61,11 +61,18 @@ def test_blocks_cover_the_rows_once_and_repeat_the_last():
 
 
 def test_a_program_of_long_motions_gives_the_same():
+    kernels = list[bool]()
+
     def motion(values):
+        kernels.append(runtime._LOOP_KERNELS.get())
         return jax.lax.fori_loop(0, 50, lambda i, x: jnp.sin(x) * 2.0 + x, values)
 
     values = np.random.default_rng(0).normal(size=(45, 40))
-    usual, long = over_population(motion)(values), over_population(motion, long=True)(values)
+    usual = over_population(motion)(values)
+    assert not any(kernels)
+    kernels.clear()
+    long = over_population(motion, long=True)(values)
+    assert kernels and all(kernels)
     np.testing.assert_allclose(long, usual, rtol=1e-4, atol=1e-6)
 
 

@@ -182,11 +182,17 @@ def primitives(jaxpr: Any) -> set[str]:
     return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*map(primitives, inner))
 
 
+@functools.lru_cache(maxsize=2)
+def within_a_step(scene: Scene) -> State:
+    """A state with its pose."""
+    state = moments(scene)[0]
+    return dataclasses.replace(state, pose=placed(scene.mjx, state.qpos))
+
+
 def test_its_laws_in_a_time_step_need_no_library(effect: Effect, scene: Scene):
     """A single sort or library call would slow the replays of every model with the effect by half."""
     theta = {p.name: jnp.float32(p.mean) for p in effect.parameters if not p.writes}
-    first = moments(scene)[0]
-    state = dataclasses.replace(first, pose=placed(scene.mjx, first.qpos))
+    state = within_a_step(scene)
     ctrl, loss = jnp.zeros(scene.model.nu), jnp.asarray(scene.model.dof_frictionloss, jnp.float32)
     laws: dict[str, tuple[Any, ...]] = {"force": (), "frictionloss": (loss,), "servo": (ctrl,), "limits": ()}
     within = [(getattr(effect, name), more) for name, more in laws.items() if getattr(effect, name)]
