@@ -8,6 +8,8 @@ Needs the package installed (`pip install -e .`), or the checkout on PYTHONPATH.
 A step is 2 ms of one sample.  Every engine replays demonstration A (a whole opening, with grasp
 contact) for the same random samples with the same cone and time step.  C and `mjx.step` have the model's own solver
 options and integrator, the replay its own step and solver (`solver_options` in the result); replay and C take turns.
+"Own blocks" is the replay as a search runs it, on a CPU with a kernel for the whole loop; "one block" has a kernel for
+each operation.
 Writes OUT/throughput.json, prints a table and, as the last line, one line of JSON.
 """
 

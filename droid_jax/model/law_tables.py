@@ -115,6 +115,8 @@ def _tables(law: _Law) -> Iterator[LawTable | NoTable]:
         yield law.no_table("a limit of the servo's torque that depends on speed")
     if effect.gear is not None:
         yield law.no_table("the motor behind the gear has a state of its own")
+    elif effect.twist is not None and effect.servo is None:
+        yield law.no_table("a replay begins with the links behind their encoders")
 
 
 @dataclass(frozen=True, eq=False)
