@@ -122,8 +122,8 @@ class Effect:
         gear: the gears between motors and links, in place of rigid ones.
         twist: (theta, State where a replay begins, servo's input [U]) -> [nv] rad (m) by which encoders are ahead of
             their links there.  The State has the encoders' readings for positions, and the input lacks the `servo` laws
-            of effects with a twist, since a servo at the reading needs no correction for it.  The State has no pose, and
-            its model the force limits of `limits`.  The links begin that far behind the recorded positions.
+            of effects with a twist, since a servo at the reading needs no correction for it.  The State has no
+            pose, and its model the force limits of `limits`.  The links begin that far behind the recorded positions.
         force: (theta, State) -> [nv] generalised force, added to qfrc_applied.
         frictionloss: (theta, State, base [nv]) -> [nv] N m, friction loss of the step.
         observe: (theta, Rollout) -> Rollout, the sensor model.
