@@ -127,8 +127,8 @@ class Influence:
     Attributes:
         edit: changes the model.
         command: (clock [T] s, command [T, U]) -> command [T, U].
-        begin: is called once, in the start pose and, in recordings, with the first command in `Live.control`; in trials
-            of policies the command there is still 0.  It may move links behind their encoders, which read the start pose.
+        begin: is called once, in the start pose and, in recordings, with the first command in `Live.control` (in trials
+            of policies it is still 0).  It may move links behind their encoders, which read the start pose.
         step: is called before each mj_step.
         sense: changes the input of the sensors.
     """
