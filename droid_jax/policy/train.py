@@ -81,7 +81,7 @@ class TrainConfig:
     batch: int = 32
     minibatches: int = 8
     epochs: int = 6
-    episode: int | None = 256
+    episode: int | None = None
     evaluations: int = 16
     eval_envs: int = 128
     enough: float = 0.98
@@ -112,10 +112,8 @@ class TrainConfig:
 
 PRESETS = {
     "quick": TrainConfig(),
-    "paper": TrainConfig(steps=20_000_000, batch=64, episode=None, evaluations=40, eval_envs=128),
-    "gpu": TrainConfig(
-        steps=40_000_000, envs=4096, batch=512, minibatches=8, episode=None, evaluations=40, eval_envs=512
-    ),
+    "paper": TrainConfig(steps=20_000_000, batch=64, evaluations=40, eval_envs=128),
+    "gpu": TrainConfig(steps=40_000_000, envs=4096, batch=512, minibatches=8, evaluations=40, eval_envs=512),
 }
 
 

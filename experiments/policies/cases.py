@@ -74,8 +74,7 @@ class Options:
         """What a policy costs."""
         if self.trials < 1:
             raise SystemExit(f"error: --trials must be 1 or more, got {self.trials}")
-        # All cost alike, and have the paper's episodes.
-        preset = replace(PRESETS[self.preset], evaluations=self.evaluations, held=0, episode=None)
+        preset = replace(PRESETS[self.preset], evaluations=self.evaluations, held=0)  # all cost alike
         config = preset if self.steps is None else replace(preset, steps=self.steps)
         if not self.quick:
             return Budget(config, self.trials, self.again)
