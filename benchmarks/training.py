@@ -73,16 +73,13 @@ class Arguments:
 
 def measured(arguments: Arguments) -> dict[str, Any]:
     """One training and its results; the policy is saved."""
-    preset = PRESETS[arguments.preset]  # with its own evaluations and episodes, which experiments share
-    asked = Options(
-        quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=preset.evaluations
-    )
+    often = PRESETS[arguments.preset].evaluations  # the preset as it is
+    asked = Options(quick=arguments.quick, preset=arguments.preset, trials=arguments.trials, evaluations=often)
     budget = asked.budget
     scene = door_scene(timestep=TIMESTEP, limits=True)
     began = time.perf_counter()
     env = DoorEnv(scene, budget.task(Task()))
-    gaussian = prior(door_space(scene) + door_nuisances(scene))
-    config = replace(budget.config, seed=arguments.seed, episode=preset.episode)
+    gaussian, config = prior(door_space(scene) + door_nuisances(scene)), replace(budget.config, seed=arguments.seed)
     doors = randomised(scene, gaussian)
     found = train(env, doors, config, progress=_tell)
     seconds = time.perf_counter() - began

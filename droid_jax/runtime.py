@@ -47,7 +47,8 @@ GARBAGE_THRESHOLDS = (50_000, 10, 10)
 PRODUCTS = "highest"
 CACHE_VARIABLE = "DROID_JAX_CACHE"
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "brax", "numpy", "scipy")
-_NAME = b"xla_cpu_small_while_loop_byte_threshold"
+LOOP_BOUND = b"xla_cpu_small_while_loop_byte_threshold"  # XLA compiles loops that touch fewer bytes into one kernel
+EVERY_LOOP = b"4000000000"  # bytes
 _LOOP_KERNELS: ContextVar[bool] = ContextVar("loop kernels", default=False)
 _EMITTERS_OFF = f"--{EMITTERS}=false"
 _DEVICE_COUNT = "--xla_force_host_platform_device_count="
@@ -180,7 +181,7 @@ def _loop_kernels_known() -> bool:
         def extended(options: Any) -> Any:
             return type(options).ParseFromString(options.SerializeAsString() + _ENTRY)
 
-        known = _NAME in extended(of_jax(num_replicas=1, num_partitions=1)).SerializeAsString()
+        known = LOOP_BOUND in extended(of_jax(num_replicas=1, num_partitions=1)).SerializeAsString()
     except (ImportError, AttributeError, TypeError, ValueError, RuntimeError):  # another version of jax
         return False
 
@@ -200,8 +201,8 @@ def _message(field: int, content: bytes) -> bytes:
     return bytes([tag & 127 | 128, tag >> 7] if tag > 127 else [tag]) + bytes([len(content)]) + content
 
 
-# CompileOptionsProto.executable_build_options.debug_options.xla_backend_extra_options[_NAME], bytes
-_ENTRY = _message(3, _message(3, _message(500, _message(1, _NAME) + _message(2, b"4000000000"))))
+# CompileOptionsProto.executable_build_options.debug_options.xla_backend_extra_options[LOOP_BOUND] = EVERY_LOOP
+_ENTRY = _message(3, _message(3, _message(500, _message(1, LOOP_BOUND) + _message(2, EVERY_LOOP))))
 
 
 def devices_mesh() -> Mesh:

@@ -55,8 +55,6 @@ class TrainConfig:
         batch: unrolls of a minibatch.
         minibatches: number of minibatches.
         epochs: number of updates with each minibatch.
-        episode: largest number of actions of an episode in training and its evaluations, where the task allows more;
-            None: the task's.  Trials of the policy last as long as the task allows.
         evaluations: number of evaluations (each saves a checkpoint) during the training.
         eval_envs: episodes of an evaluation.
         enough: success rate that ends the training,
@@ -81,7 +79,6 @@ class TrainConfig:
     batch: int = 32
     minibatches: int = 8
     epochs: int = 6
-    episode: int | None = None
     evaluations: int = 16
     eval_envs: int = 128
     enough: float = 0.98
@@ -96,7 +93,6 @@ class TrainConfig:
             **dict.fromkeys(("learning_rate", "clip", "reward_scaling"), partial(number, above=0)),
             **dict.fromkeys(("discount", "gae"), partial(number, least=0, most=1)),
             devices=optional(partial(whole, least=1)),
-            episode=optional(partial(whole, least=1)),
             hidden=several(partial(whole, least=1)),
             entropy=partial(number, least=0),
             enough=partial(number, above=0, most=1),
@@ -295,7 +291,7 @@ def _ppo(
         environment=env,
         num_timesteps=steps,
         num_envs=config.envs,
-        episode_length=min(env.task.steps, config.episode or env.task.steps),
+        episode_length=env.task.steps,
         learning_rate=config.learning_rate,
         entropy_cost=config.entropy,
         discounting=config.discount,

@@ -112,8 +112,8 @@ def gear_of(effects: Sequence[Effect]) -> Gear | None:
 
 def held_gears(
     command: jax.Array, theta: Theta, state: State, effects: Sequence[Effect]
-) -> tuple[jax.Array, jax.Array] | None:
-    """The gears where a replay begins, held by the servos' torques; None if all are rigid.
+) -> tuple[jax.Array, jax.Array]:
+    """The gears where a replay begins, held by the servos' torques.
 
     Args:
         command: [U] to the servos.
@@ -125,8 +125,6 @@ def held_gears(
         `State.motors`, and [nv] rad (m) by which encoders are ahead of their links (`Effect.twist`).
     """
     gear, twists = gear_of(effects), [effect.twist for effect in effects if effect.twist is not None]
-    if gear is None and not twists:
-        return None
     ctrl = servo_input(command, theta, state, [effect for effect in effects if effect.twist is None])
     state = replace(state, model=apply_limits(state.model, theta, state, effects))
     motors = state.motors if gear is None else gear.start(theta, state, ctrl)

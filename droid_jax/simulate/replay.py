@@ -281,10 +281,10 @@ def servo_motion(
         sent = profiled(table, drive.timestep, theta, effects)
         sample = model, theta, encoder_error(scene, model), sent, origin
         moving = Moving.at(start, jnp.zeros(scene.model.nv, jnp.float32) if speed is None else speed)
-        given = _command(sent, drive.timestep, jnp.int32(earlier), shift, theta, effects)
-        state = moving.state(jnp.float32(0.0) if origin is None else origin, model)
-        if held := held_gears(given, theta, state, effects):
-            motors, ahead = held  # the recorded position is the encoder's
+        if any(effect.gear or effect.twist for effect in effects):
+            given = _command(sent, drive.timestep, jnp.int32(earlier), shift, theta, effects)
+            state = moving.state(jnp.float32(0.0) if origin is None else origin, model)
+            motors, ahead = held_gears(given, theta, state, effects)  # the recorded position is the encoder's
             moving = moving._replace(motors=motors, qpos=start.at[positions].add(-ahead[joints]))
         traces = jnp.zeros((3, rows, len(joints)), jnp.float32)
         angle, contact = jnp.zeros(rows, jnp.float32), jnp.zeros((rows, len(fingers)), bool)

@@ -117,8 +117,6 @@ class Budget:
     def to_json(self) -> dict[str, Any]:
         """As plain data; the seed is each policy's own."""
         config = json.loads(json.dumps(asdict(replace(self.config, seed=0))))
-        if config["episode"] is None:  # earlier results lack the setting
-            del config["episode"]
         return {**config, "trials": self.trials, **({"again": self.again} if self.again else {})}
 
     def task(self, task: Task) -> Task:

@@ -74,7 +74,7 @@ def trained(
 
 def decided_by(env: DoorEnv, doors: Doors, config: TrainConfig) -> dict[str, Any]:
     """All that decides what training comes to, as plain data."""
-    unused = (*(() if config.held else ("enough", "held")), *(("episode",) if config.episode is None else ()))
+    unused = () if config.held else ("enough", "held")
     of = {
         "scene": _scene(env.scene),
         "effects": [effect.name for effect in env.effects],

@@ -279,7 +279,7 @@ def test_the_models_of_every_step_whose_choice_is_open_are_in_the_verdict(found:
     assert groups(found, "ab", first, second) == [["a", "x"]]
     assert groups(found, "ab", first, selecting(found, "a", "ab", "ay")) == [["a", "x"], ["ab", "ay"]]
     assert groups(found, "ab", selecting(found, "", "a"), selecting(found, "a", "ab", "ay")) == [["ab", "ay"]]
-    assert groups(found, "ab", first, selecting(found, "", "ab")) == []  # the pair was chosen anew
+    assert groups(found, "ab", first, selecting(found, "", "ab")) == []  # the pair was selected instead
     assert groups(found, "b", first, second) == []  # a was taken out again
     assert groups(found, "ax", first, selecting(found, "a", "ax")) == []  # both are in the model
 
