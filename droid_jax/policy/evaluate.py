@@ -1,17 +1,22 @@
-"""Evaluate a policy in simulation: many episodes in one batch."""
+"""Evaluate a policy in simulation: many episodes in one batch, split over the devices.
+
+Training and `evaluate` share the compiled program where they have equally many rows.
+"""
 
 from __future__ import annotations
 
 import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx with its two lines about warp
 
 # isort: split
-import functools
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.wrappers.training import DomainRandomizationVmapWrapper, VmapWrapper
+from jax.sharding import PartitionSpec
 
 from droid_jax import runtime
 from droid_jax.policy.control import Policy, differing
@@ -23,11 +28,11 @@ jax.tree_util.register_dataclass(  # not where it is defined: control.py needs n
     Policy, data_fields=("mean", "std", "weights", "biases"), meta_fields=("interface",)
 )
 
+ROWS = 64  # of a device: numbers of episodes up to its multiples share a program
+
 
 def simulated(policy: Policy, env: Environment, randomise: Randomise | None, episodes: int, seed: int = 0) -> Trials:
     """Simulate episodes of the deterministic policy.
-
-    The policy and the physics that vary are inputs of the program, so that other policies and draws share it.
 
     Args:
         policy: to be evaluated.
@@ -45,31 +50,77 @@ def simulated(policy: Policy, env: Environment, randomise: Randomise | None, epi
     if other := differing(policy.interface, env.interface):
         raise ValueError(f"the policy was trained for another robot, door or task: {', '.join(other)} differ")
     start, physics = jax.random.split(jax.random.key(seed))
-    drawn, axes = (env.sys, None) if randomise is None else randomise(env.sys, jax.random.split(physics, episodes))
+    return batch_of_episodes(env, randomise, episodes, physics)(policy, start).trials
 
-    @functools.partial(jax.jit, compiler_options=runtime.compiler_options())
+
+class Played(NamedTuple):
+    """Outcomes of episodes, and their mean sum of rewards."""
+
+    trials: Trials
+    reward: float
+
+
+def batch_of_episodes(
+    env: Environment, randomise: Randomise | None, episodes: int, physics: jax.Array
+) -> Callable[[Policy, jax.Array], Played]:
+    """A function that simulates episodes of a policy, always with the same draws of the physics.
+
+    The policy and the physics that vary are inputs of the program, so that other policies and draws share it.
+
+    Args:
+        env: of the robot, door and task that policies are trained for.
+        randomise: as in `simulated`.
+        episodes: number of them.
+        physics: key of the draws.
+
+    Returns:
+        (policy, key of the starts) -> the outcomes.
+    """
+    drawn, axes = (env.sys, None) if randomise is None else randomise(env.sys, jax.random.split(physics, episodes))
+    devices = runtime.devices_mesh()
+    row = np.minimum(np.arange(_rows(episodes, devices.size)), episodes - 1)  # of each episode; the last one fills up
+    rows = PartitionSpec(*devices.axis_names)
+    varied = jax.tree.map(lambda leaf: leaf[row], _varied(axes, drawn))
+
     def run(policy, varied, keys):
         sys: Any = _filled(axes, varied, drawn), axes
         many = VmapWrapper(env) if randomise is None else DomainRandomizationVmapWrapper(env, lambda _: sys)
 
         def step(carry, _):
-            state, won, best, grips, count, steps = carry
+            state, won, best, grips, rewards, count, steps = carry
             going = state.done == 0.0
             after = many.step(state, policy.act(state.obs, jnp))
             state = jax.tree.map(lambda new, old: jnp.where(_as(going, new), new, old), after, state)
             best = jnp.maximum(best, state.metrics["angle"])
             success, grip = going * after.metrics["success"], going * after.metrics["grip"]
-            return (state, won + success, best, grips + grip, count + going, steps + (going & (won == 0.0))), None
+            rewards = rewards + going * after.reward
+            won, steps = won + success, steps + (going & (won == 0.0))
+            return (state, won, best, grips + grip, rewards, count + going, steps), None
 
-        nothing = jnp.zeros(episodes)
-        carry = (many.reset(keys), nothing, nothing, nothing, nothing, nothing)
-        (state, won, best, grips, count, steps), _ = jax.lax.scan(step, carry, None, length=env.task.steps)
-        return won, best, steps, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"]
+        carry = (many.reset(keys), *[jnp.zeros(len(keys))] * 6)
+        (state, won, best, grips, rewards, count, steps), _ = jax.lax.scan(step, carry, None, length=env.task.steps)
+        return won, best, steps, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"], rewards
 
-    found = run(policy, _varied(axes, drawn), jax.random.split(start, episodes))
-    won, angle, steps, grip, blown_up = (np.asarray(a) for a in found)
-    stopped = np.where(blown_up > 0, BLOWN_UP, "")
-    return Trials(won > 0, angle.astype(float), steps.astype(int), grip.astype(float), stopped)
+    # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
+    each = jax.shard_map(
+        run, mesh=devices, in_specs=(PartitionSpec(), rows, rows), out_specs=rows, check_vma=False
+    )  # fmt: skip
+    program = jax.jit(each, compiler_options=runtime.compiler_options())
+
+    def played(policy: Policy, start: jax.Array) -> Played:
+        found = program(policy, varied, jax.random.split(start, episodes)[row])
+        won, angle, steps, grip, blown_up, rewards = (np.asarray(a)[:episodes] for a in found)
+        stopped = np.where(blown_up > 0, BLOWN_UP, "")
+        trials = Trials(won > 0, angle.astype(float), steps.astype(int), grip.astype(float), stopped)
+        return Played(trials, float(rewards.mean()))
+
+    return played
+
+
+def _rows(episodes: int, devices: int) -> int:
+    """Rows of the program: as many for each device, and whole blocks of `ROWS` where they are many."""
+    each = math.ceil(episodes / devices)
+    return devices * (each if each <= ROWS // 2 else ROWS * math.ceil(each / ROWS))
 
 
 def _varied(axes: Any, drawn: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Batched environments with different physics in each environment and on each device.
+"""Batched environments with different physics in each environment and on each device, for brax's PPO.
 
 brax gives all devices the same keys for its randomisation: on sixteen devices 256 environments would share 16 doors.
 It also draws new physics for each part of an interrupted training.
@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, wrap
-from jax.sharding import SingleDeviceSharding
 
 from droid_jax.policy.randomise import Randomise
 
@@ -28,21 +27,18 @@ AXIS = "i"  # brax's name for its devices
 def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..., Env]:
     """The wrapper that brax's PPO applies to its environment, once for training and once for evaluations.
 
-    Evaluations have other draws of the physics than training.  Otherwise the best policy would be selected on its
-    training draws.
+    We have evaluations of our own (`evaluate.batch_of_episodes`), which use all devices; brax's are never run.
     """
     uses = itertools.count()
 
     def wrap_env(env: Env, episode_length: int, action_repeat: int, randomization_fn: Any) -> Env:
-        use = next(uses)
+        if next(uses):
+            return Unused(env)
         if randomise is None:
-            same = wrap(env, episode_length, action_repeat)
-            return Committed(same) if use else same
+            return wrap(env, episode_length, action_repeat)
         count = len(randomization_fn.keywords["rng"])  # of environments on one device
-        used = 1 if use else devices  # evaluations use one, so that their draws do not depend on the machine
-        drawn = RandomisedEnvs(env, randomise, count, used, jax.random.fold_in(jax.random.PRNGKey(seed), use))
-        each = AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
-        return Committed(each) if use else each
+        drawn = RandomisedEnvs(env, randomise, count, devices, jax.random.fold_in(jax.random.PRNGKey(seed), 0))
+        return AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
 
     return wrap_env
 
@@ -90,20 +86,17 @@ class RandomisedEnvs(Wrapper):
             env.sys = before
 
 
-class Committed(Wrapper):
-    """Environments of brax's evaluations whose first state is committed to a device, as their last ones are.
-
-    brax passes the last state of an evaluation to the next one.  If only one of them were committed, the evaluation
-    would be compiled twice.
-    """
+class Unused(Wrapper):
+    """The environment of brax's evaluations, whose reset brax compiles although it runs none of them."""
 
     def reset(self, rng: jax.Array) -> State:
-        """Reset all environments; rng: a key for each."""
-        return jax.lax.with_sharding_constraint(self.env.reset(rng), SingleDeviceSharding(jax.local_devices()[0]))
+        """A state without content; rng: a key for each environment."""
+        nothing = jnp.zeros(len(rng))
+        return State(None, nothing, nothing, nothing)
 
 
 def device_index() -> jax.Array:
-    """Index of the device on which brax runs this; 0 if it uses one device, as in evaluations."""
+    """Index of the device on which brax runs this; 0 if it uses one device."""
     try:
         return jax.lax.axis_index(AXIS)
     except NameError:  # no mapped axis

@@ -25,6 +25,7 @@ from droid_jax.model.physics import POSE, UNIT, Physics, entries_written, joined
 from droid_jax.model.scene import TINY_FRICTIONLOSS, Scene
 
 Randomise = Callable[[Any, jax.Array], tuple[Any, Any]]
+ROWS = 256  # draws are compiled for multiples of it
 
 
 def randomised(scene: Scene, gaussian: Gaussian) -> Randomise:
@@ -145,8 +146,13 @@ def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
 
 def physics_of(scene: Scene, space: Space, values: np.ndarray) -> Physics:
     """Physics of rows of values [N, D], batched along `axes`."""
-    make = jax.vmap(lambda row: make_physics(scene, space, row), out_axes=axes(scene, space))
-    return jax.jit(make)(jnp.asarray(values, jnp.float32))
+    count, each = len(values), axes(scene, space)
+    whole = jnp.concatenate([values, jnp.repeat(values[-1:], -count % ROWS, axis=0)])  # the last row fills up
+    make = jax.vmap(lambda row: make_physics(scene, space, row), out_axes=each)
+    made = jax.jit(make)(jnp.asarray(whole, jnp.float32))
+    return jax.tree.map(
+        lambda axis, leaf: leaf if axis is None else leaf[:count], each, made, is_leaf=lambda axis: axis is None
+    )
 
 
 def axes(scene: Scene, space: Space) -> Physics:

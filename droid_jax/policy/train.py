@@ -31,9 +31,11 @@ from droid_jax.arguments import check_fields, number, optional, several, whole
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import LAYOUT, Policy
 from droid_jax.policy.environment import Environment
+from droid_jax.policy.evaluate import batch_of_episodes
 from droid_jax.policy.network import layer_sizes, policy_of
 from droid_jax.policy.parallel import AXIS, wrapped
 from droid_jax.policy.randomise import Randomise
+from droid_jax.policy.trials import BLOWN_UP
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class TrainConfig:
         evaluations: number of evaluations (each saves a checkpoint) during the training.
         eval_envs: episodes of an evaluation.
         enough: success rate that ends the training,
-        held: if so many consecutive evaluations reach it; 0: the training makes all its steps.
+        held: if the last evaluation and so many together reach it; 0: the training makes all its steps.
         seed: of all randomness.
 
     Raises:
@@ -229,39 +231,43 @@ def _brax(
     """Run brax's PPO after `done` actions, from the networks of a checkpoint's `tree` if there is one."""
     history = [TrainProgress(int(row[0]), *row[1:]) for row in tree["history"].tolist()] if tree else []
     began = time.monotonic() - (history[-1].seconds if history else 0.0)
-    latest: Any = None
     best: Any = None
+    batch: Any = None  # of episodes, compiled once
+    seed = jax.random.PRNGKey(config.seed)
 
-    def after_evaluation(step: int, metrics: dict[str, Any]) -> None:
-        nonlocal best
+    def as_policy(params: Any) -> Policy:
+        normaliser, actor, _ = params
+        return policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface)
+
+    def updated(step: int, _: Any, params: Any) -> None:
+        """Evaluate brax's parameters after `step` actions; 0 is before the first, or at the checkpoint."""
+        nonlocal best, batch
+        if step and not _finite(params):
+            raise _Ended
+        batch = batch or batch_of_episodes(env, randomise, config.eval_envs, jax.random.fold_in(seed, 1))
+        played = batch(as_policy(params), jax.random.fold_in(seed, 2 + done + step))
         seconds = time.monotonic() - began
         now = TrainProgress(
             step=done + step,
             of=config.steps,
             seconds=seconds,
             rate=(done + step - history[-1].step) / (seconds - history[-1].seconds) if step else 0.0,
-            reward=float(metrics["eval/episode_reward"]),
-            success=float(metrics["eval/episode_success"]),
-            blown_up=float(metrics["eval/episode_blown_up"]),
+            reward=played.reward,
+            success=float(played.trials.success.mean()),
+            blown_up=float((played.trials.stopped == BLOWN_UP).mean()),
         )
         progress(now)
-        if not step:  # before the first update, or at the checkpoint from which the training continues
+        if not step:
             if not history:
                 history.append(now)
             return
-        if not _finite(latest):
-            raise _Ended
         if best is None or _rank(now) >= max(_rank(h) for h in history if h.step):
-            best = latest
+            best = params
         history.append(now)
         rows = np.array([list(asdict(h).values()) for h in history], np.float64)
-        save(done + step, {"latest": to_tree(latest), "best": to_tree(best), "history": rows})
+        save(done + step, {"latest": to_tree(params), "best": to_tree(best), "history": rows})
         if _held(history, config):
             raise _Ended
-
-    def before_evaluation(step: int, _: Any, params: Any) -> None:
-        nonlocal latest
-        latest = params
 
     with replicated():
         params: Any = None
@@ -270,22 +276,24 @@ def _brax(
             params, best = (from_tree(blank, tree[name]) for name in ("latest", "best"))
         if done < config.steps and not _held(history, config):
             with contextlib.suppress(_Ended):
-                hooks = {"progress_fn": after_evaluation, "policy_params_fn": before_evaluation}
-                _ppo(env, randomise, config, done, params, **hooks)
+                _ppo(env, randomise, config, done, params, updated)
     if best is None:
         raise ValueError(
             "training ended in NaN or infinite weights: try another --seed "
             "(in Python, a smaller TrainConfig.learning_rate too)"
         )
-    normaliser, actor, _ = best
-    policy = policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface)
-    return TrainedPolicy(policy, tuple(history), _held(history, config) and history[-1].step < config.steps)
+    return TrainedPolicy(as_policy(best), tuple(history), _held(history, config) and history[-1].step < config.steps)
 
 
 def _ppo(
-    env: Environment, randomise: Randomise | None, config: TrainConfig, done: int, restore: Any, **hooks: Any
+    env: Environment,
+    randomise: Randomise | None,
+    config: TrainConfig,
+    done: int,
+    restore: Any,
+    updated: Callable[[int, Any, Any], None],
 ) -> Any:
-    """Call brax's PPO with the settings of `config`, for the actions after `done`."""
+    """Call brax's PPO with the settings of `config`, for the actions after `done`; `updated` gets its parameters."""
     steps = config.steps - done
     return ppo.train(
         environment=env,
@@ -306,13 +314,13 @@ def _ppo(
         network_factory=_networks(config),
         seed=config.seed + done,
         num_evals=evaluations_left(config, steps),
-        num_eval_envs=config.eval_envs,
-        deterministic_eval=True,
+        num_eval_envs=1,
+        run_evals=False,  # brax's use one device
         randomization_fn=randomise,
         wrap_env_fn=wrapped(randomise, config.devices or 1, config.seed),
         max_devices_per_host=config.devices,
         restore_params=restore,
-        **hooks,
+        policy_params_fn=updated,
     )
 
 
@@ -321,9 +329,9 @@ class _Ended(Exception):
 
 
 def _held(history: Sequence[TrainProgress], config: TrainConfig) -> bool:
-    """Whether each of the last `config.held` evaluations had sufficient success."""
+    """Whether success was sufficient in the last evaluation, and in the last `config.held` ones together."""
     last = [now.success for now in history[-config.held :]] if config.held else []
-    return len(last) == config.held > 0 and min(last) >= config.enough
+    return len(last) == config.held > 0 and min(last[-1], sum(last) / len(last)) >= config.enough
 
 
 def _networks(config: TrainConfig) -> Callable[..., Any]:
@@ -388,11 +396,7 @@ _REPLICATED = "device_put_replicated"
 
 
 class replicated:
-    """Provide jax.device_put_replicated, which brax 0.14.2 calls once, as `put_replicated`.
-
-    jax 0.10 removed it.  That of jax 0.9 places its copies unlike the results of brax's programs, so brax's evaluation
-    would be compiled twice, for networks before and after the first update.
-    """
+    """Provide jax.device_put_replicated, which brax 0.14.2 calls once and jax 0.10 removed, as `put_replicated`."""
 
     def __init__(self, module: Any = jax) -> None:
         self._module = module

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
+from droid_jax import runtime
 from droid_jax.door.environment import DoorEnv
 from droid_jax.door.scene import door_scene
 from droid_jax.door.space import door_space
@@ -59,6 +60,18 @@ def network(weight: float) -> Policy:
 
 def draws(sys: Door, rng: Any) -> tuple[Door, Door]:
     return Door(jax.vmap(jax.random.uniform)(rng), sys.height), Door(0, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("episodes", [5, 70])
+def test_outcomes_do_not_depend_on_the_devices(monkeypatch: pytest.MonkeyPatch, episodes: int):
+    """Rows that fill up devices and blocks are not counted."""
+    env: Any = Opening()
+    assert len(jax.local_devices()) > 1
+    many = simulated(network(0.5), env, draws, episodes)
+    monkeypatch.setattr(runtime, "devices_mesh", lambda: jax.sharding.Mesh(np.array(jax.local_devices()[:1]), ("a",)))
+    one = simulated(network(0.5), env, draws, episodes)
+    assert many.angle.shape == (episodes,) and len(np.unique(many.angle)) == episodes
+    np.testing.assert_array_equal(one.angle, many.angle)
 
 
 def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.MonkeyPatch):
