@@ -104,7 +104,7 @@ def run(command: Train) -> None:
         )  # fmt: skip
     save_policy(out / POLICY, found.policy)
     if (done := found.history[-1].step) < config.steps:
-        held = f"{config.held} evaluations in a row had {config.enough:.0%} success or more"
+        held = f"the last {config.held} evaluations together had {config.enough:.0%} success or more"
         why = held if found.held else "its weights became NaN or infinite"
         print(f"training ended after {done} of {config.steps} actions: {why}")
     write_json(
