@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from droid_jax.commands import identify
+from droid_jax.commands import identify, report
 from droid_jax.commands.identify import Identify
 from droid_jax.commands.pictures import draw_replay, keep_replay, measured_states
 from droid_jax.model.scene import Scene, load_scene
@@ -16,15 +17,17 @@ from droid_jax.recordings.recording import Channel, Recording
 from droid_jax.report import page, render, viewer
 from droid_jax.storage import write_npz
 
+TWO_LINK = Path(__file__).resolve().parents[1] / "docs" / "examples" / "two_link.xml"
 OLD = ("frames/after_00_0.0s.png", "films/replay.webp", "replay.npz", "viewer.html")
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene(Path(__file__).resolve().parents[1] / "docs" / "examples" / "two_link.xml")
+    return load_scene(TWO_LINK)
 
 
 def replay(folder: Path, states: np.ndarray) -> None:
+    shutil.copy(TWO_LINK, folder / "fitted.xml")
     write_npz(folder / "replay.npz", {"time": np.arange(len(states)) / 25.0, "before": states, "after": states})
 
 
@@ -98,19 +101,19 @@ def test_what_could_not_be_drawn_is_drawn_later_and_once(
     monkeypatch.setattr(render, "rendered_frames", drawn)
     monkeypatch.setattr(render, "film", lambda path, model, sides, period, camera: asked.append(period))
     monkeypatch.setattr(viewer, "write_viewer", lambda *_: None)
-    draw_replay(tmp_path, scene)  # nothing to draw
+    draw_replay(tmp_path)  # nothing to draw
     replay(tmp_path, np.zeros((5, scene.model.nq)))
-    draw_replay(tmp_path, scene)
+    draw_replay(tmp_path)
     assert "no pictures: no OpenGL here" in capsys.readouterr().err and not (tmp_path / "frames").exists()
     asked.append(0.0)
     for _ in range(2):
-        draw_replay(tmp_path, scene)
+        draw_replay(tmp_path)
     assert asked[1:] == [pytest.approx(0.04)] and len(list((tmp_path / "frames").glob("after_*.png"))) == 4
 
 
 def test_a_replay_that_cannot_be_shown_ends_no_run(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     replay(tmp_path, np.full((5, scene.model.nq), np.nan))
-    draw_replay(tmp_path, scene)
+    draw_replay(tmp_path)
     assert "no pictures: frames: qpos row 0 is not finite" in capsys.readouterr().err
     assert not (tmp_path / "frames").exists()
 
@@ -119,7 +122,7 @@ def test_a_finished_run_is_asked_for_its_pictures(tuned: None, tmp_path: Path, m
     """Before its page is built: OpenGL may be there by now."""
     did = list[str]()
     monkeypatch.setattr(identify, "finished", lambda *_: True)
-    monkeypatch.setattr(identify, "draw_replay", lambda out, scene: did.append(f"draw {scene.name}"))
+    monkeypatch.setattr(report, "draw_replay", lambda out: did.append("draw"))
     monkeypatch.setattr(page, "write_report", lambda folder: did.append("report"))
     identify.run(Identify(out=tmp_path))
-    assert len(did) == 2 and did[0].startswith("draw door") and did[1] == "report"
+    assert did == ["draw", "draw", "report"]  # of the folder, or of its part

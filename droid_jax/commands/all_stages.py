@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from droid_jax import distributed
-from droid_jax.commands import evaluate, gap, identify, train
+from droid_jax.commands import evaluate, gap, identify, report, train
 from droid_jax.commands.folder import OtherRun, changed, forget, setup_of
 from droid_jax.commands.options import (
     TIMESTEP,
@@ -135,7 +135,8 @@ def run(command: All) -> None:
     if command.again:
         for stage in [stage for stage in command.stages if stage in LAST_FILES][1:]:
             forget(out / stage, stage)
-    _run_stages(command, out, roles)
+    with report.drawn_meanwhile():
+        _run_stages(command, out, roles)
     from droid_jax.report.page import write_report  # matplotlib: not before the stages
 
     page = write_report(out)

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
+from droid_jax.commands import report
 from droid_jax.commands.folder import begin, fingerprints, finished, refuse_own_source, setup_of, stage_folder
 from droid_jax.commands.gap_search import searched
 from droid_jax.commands.options import (
@@ -333,12 +334,10 @@ def given_to(command: GapCommand) -> list[Recording]:
 def _done(out: Path) -> None:
     """Build the page and print a summary."""
     from droid_jax.report.gap_folder import largest_shifts, read_gap
-    from droid_jax.report.page import write_report
     from droid_jax.report.text import lines
 
     gap = read_gap(out)
-    page = write_report(out)
     shifted = next(iter(largest_shifts(gap.found.shifts)), None)
     for line in lines("gap.txt.jinja", gap=gap, found=gap.found, shifted=shifted):
         print(line)
-    print(f"report: {page}")
+    report.run(report.Report(out))

@@ -29,7 +29,7 @@ from droid_jax.commands.options import (
     search_config,
     warn_of_cpu,
 )
-from droid_jax.commands.pictures import draw_replay, keep_replay
+from droid_jax.commands.pictures import keep_replay
 from droid_jax.commands.synthetic import known_robot, with_robot_options
 from droid_jax.commands.writer import writes
 from droid_jax.files import EXTENDED
@@ -148,7 +148,6 @@ def run(command: Identify) -> None:
     setup = {**setup_of(command), **fingerprints(scene, space if nuisances is None else space + nuisances, given)}
     setup |= {"judge_on_sha256": [recording.sha256 for recording in judges]} if judges else {}
     if finished(out, setup, command.again):
-        draw_replay(out, scene)  # if OpenGL was missing before, or drawing was stopped
         report.run(report.Report(out))
         return
     config = identify_config(command)
@@ -191,7 +190,6 @@ def run(command: Identify) -> None:
             ],
             findings=[finding for recording in (*recordings, *judges) for finding in check_log(scene, recording)],
         )  # fmt: skip
-    draw_replay(out, scene)
     report.run(report.Report(out))
     _summary(found, read_fit(out), [r.repeats for r in recordings])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from droid_jax import distributed
-from droid_jax.files import FILMS, REPLAY, REPLAY_FILM, VIEWER
+from droid_jax.files import FILMS, FITTED, REPLAY, REPLAY_FILM, VIEWER
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,21 +81,24 @@ def measured_states(scene: Scene, recording: Recording, time: np.ndarray, else_:
     return {"measured": states, "measured_joints": np.array(joints), "start": np.array(start)} if joints else {}
 
 
-def draw_replay(out: Path, scene: Scene) -> None:
-    """Draw the film, the frames and the viewer of replay.npz, unless they exist.
+def draw_replay(out: Path) -> None:
+    """Draw the film, the frames and the viewer of replay.npz with the fitted scene, unless they exist.
 
     If this fails (no OpenGL, a diverged replay) a message is printed, and the page has no pictures.
     """
+    import mujoco
+
+    from droid_jax.model.scene import for_pictures
     from droid_jax.report.reading import Reader, read_replay
     from droid_jax.report.render import NoOpenGL, film, rendered_frames, save_frames
     from droid_jax.report.viewer import write_viewer
     from droid_jax.storage import new_folder
 
-    if not distributed.first() or not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
+    if not (distributed.first() and (out / REPLAY).is_file() and (out / FITTED).is_file()) or (out / FRAMES).is_dir():
         return
     try:
         time, before, after = read_replay(out / REPLAY, Reader("identify"))
-        model = scene.visual_model()
+        model = for_pictures(mujoco.MjModel.from_xml_path(str(out / FITTED)))
         camera = "front" if "front" in {model.camera(i).name for i in range(model.ncam)} else None
         rows = [int(f * (len(after) - 1)) for f in FRAME_TIMES]
         images = rendered_frames(model, after, rows, camera)

@@ -230,10 +230,7 @@ class Scene:
 
     def visual_model(self) -> mujoco.MjModel:
         """The model with visual geoms, for rendering, with an offscreen buffer of at least PICTURE."""
-        model = compiled(self.spec)
-        buffer = model.vis.global_  # the MJCF may ask for a small one
-        buffer.offheight, buffer.offwidth = np.maximum((buffer.offheight, buffer.offwidth), PICTURE)
-        return model
+        return for_pictures(compiled(self.spec))
 
     def initial_qpos(self, positions: dict[str, float] | Any) -> np.ndarray:
         """[nq] the model's reference pose with named joints set, rad and m; ValueError for unknown names."""
@@ -265,6 +262,13 @@ class Scene:
                 f"missing: {', '.join(missing)}; given: {', '.join(names) or 'none'}"
             )
         return np.array([list(names).index(n) if n in names else -1 for n in self.command_names], dtype=int)
+
+
+def for_pictures(model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model itself, with an offscreen buffer of at least PICTURE."""
+    buffer = model.vis.global_  # the MJCF may ask for a small one
+    buffer.offheight, buffer.offwidth = np.maximum((buffer.offheight, buffer.offwidth), PICTURE)
+    return model
 
 
 def sha256_of(model: mujoco.MjModel) -> str:

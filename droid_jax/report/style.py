@@ -15,13 +15,17 @@ variables, so that the same drawing is readable on a dark page.
 from __future__ import annotations
 
 import base64
+import contextlib
+import hashlib
 import io
 import itertools
+import json
 import math
+import pickle
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, cast
 
@@ -35,7 +39,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import ScalarFormatter
 
-from droid_jax.storage import write_bytes
+from droid_jax.storage import write_bytes, write_json
 
 WIDE = 9.2  # inches: a desk, paper
 NARROW = 4.4  # inches: a phone
@@ -262,11 +266,49 @@ class Drawing:
 
 
 def drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> Drawing:
-    """The figure `make(*args, width=...)` draws, for the page; PNG and PDF copies go to FOLDER/figures/STEM.*."""
+    """The figure `make(*args, width=...)` draws, for the page; PNG and PDF copies go to FOLDER/figures/STEM.*.
+
+    STEM.json there keeps the page's HTML, which is used again as long as the data and this package are the same.
+    """
+    of, path = _content(title, make, args), folder / "figures" / f"{stem}.json"
+    if of and (kept := _kept(path, of)):
+        return Drawing(path.parent, stem, title, *kept)
     wide, narrow = (settled(make(*args, width=width)) for width in (WIDE, NARROW))
     save(wide, folder / "figures", stem)
     html = [_inline(f, stem, kind, title) for kind, f in (("wide", wide), ("narrow", narrow))]
-    return Drawing(folder / "figures", stem, title, *html)
+    if of:
+        write_json(path, {"of": of, "html": html})
+    return Drawing(path.parent, stem, title, *html)
+
+
+def _content(title: str, make: Callable[..., Figure], args: tuple[Any, ...]) -> str | None:
+    """A hash of all that a drawing depends on; None for data that cannot be pickled."""
+    with io.BytesIO() as buffer:
+        pickler = pickle.Pickler(buffer)
+        pickler.fast = True  # else equal data would differ by which of their parts are one object
+        try:
+            pickler.dump((title, make, args))
+        except (pickle.PicklingError, AttributeError, TypeError, ValueError):
+            return None
+        return hashlib.sha256(_sources() + buffer.getvalue()).hexdigest()
+
+
+@cache
+def _sources() -> bytes:
+    """A hash of the modules that draw, and of matplotlib's version."""
+    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    return hashlib.sha256(b"".join([matplotlib.__version__.encode(), *texts])).digest()
+
+
+def _kept(path: Path, of: str) -> tuple[Markup, Markup] | None:
+    """HTML of an earlier drawing of the same content; None if there is none, or its copies are missing."""
+    if not all(path.with_suffix(kind).is_file() for kind in (".json", ".png", ".pdf")):
+        return None
+    with contextlib.suppress(ValueError, OSError, KeyError, TypeError):  # damaged: it is drawn again
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        wide, narrow = kept["html"]
+        return (Markup(wide), Markup(narrow)) if kept["of"] == of else None
+    return None
 
 
 def _inline(figure: Figure, stem: str, kind: str, title: str) -> Markup:
