@@ -40,7 +40,7 @@ from droid_jax.identify.multistart import RefineConfig  # noqa: E402
 from droid_jax.identify.pipeline import IdentifyConfig  # noqa: E402
 from droid_jax.model.scene import Scene  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
-from droid_jax.rehearsal.config import RehearsalConfig  # noqa: E402
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig  # noqa: E402
 from droid_jax.rehearsal.full import FullRehearsal, HiddenCase, hidden_case, run_case  # noqa: E402
 from droid_jax.rehearsal.linearised import rehearsed  # noqa: E402
 from droid_jax.rehearsal.plan import RehearsalPlan  # noqa: E402
@@ -245,6 +245,7 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
     steps = sorted({round(c["size"] / entry["smallest"], 3) for c in cases})
     rates = {t: [bool(c["found"]) for c in cases if round(c["size"] / entry["smallest"], 3) == t] for t in steps}
     ratio = measured_size(entry, cases)
+    promised = min(DEFAULT_REHEARSAL.promise, entry["bound"] / entry["smallest"])  # times the predicted size
     return {
         "effect": entry["effect"],
         "location": entry["location"],
@@ -258,6 +259,7 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
         "measured_over_predicted": None if ratio is None or not np.isfinite(ratio) else ratio,
         "not_found_at_twice": bool(ratio == np.inf),
         "missed": any(t > CLOSE and not all(f) for t, f in rates.items()),
+        "missed_at_promised": any(t > CLOSE * promised and not all(f) for t, f in rates.items()),
         "within": None if ratio is None else bool(1 / FACTOR <= ratio <= FACTOR),
         "answers": [c["sentence"] if "sentence" in c else c["error"] for c in cases],
     }
@@ -266,7 +268,8 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
 def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Shares over the effects whose smallest size is known.
 
-    Wrong advice: an effect predicted to be surely found was not found at that size or above.
+    Wrong advice: an effect predicted to be surely found was not found at the promised size (`RehearsalConfig.promise`)
+    or above.
     """
     done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
     every = [e for effects in by_scene.values() for e in effects if e["sure"]]
@@ -276,7 +279,8 @@ def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, An
         "effects": len(done),
         "within_factor": float(np.mean([e["within"] for e in done])) if done else None,
         "advised": len(advised),
-        "wrong_advice_rate": float(np.mean([e["missed"] for e in advised])) if advised else None,
+        "wrong_advice_rate": float(np.mean([e["missed_at_promised"] for e in advised])) if advised else None,
+        "missed_at_predicted_rate": float(np.mean([e["missed"] for e in advised])) if advised else None,
         "sure": len(sure),
         "within_factor_of_sure": float(np.mean([e["within"] for e in sure])) if sure else None,
         "unsure_not_found": sum(e["not_found_at_twice"] for e in done if not e["sure"]),

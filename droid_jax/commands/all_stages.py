@@ -47,7 +47,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.5, "identify": 2.9, "gap": 5.9, "train": 6.6, "evaluate": 1.7}
+MINUTES = {"record": 0.5, "identify": 2.1, "gap": 4.2, "train": 4.2, "evaluate": 1.5}
 """Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
@@ -213,6 +213,7 @@ def _run_stages(command: All, out: Path, roles: tuple[str, ...]) -> None:
         try:
             run_stage()
         except Exception:
+            report.wait_for_pages()
             if number > 1:
                 from droid_jax.report.page import write_report
 

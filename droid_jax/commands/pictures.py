@@ -86,6 +86,8 @@ def draw_replay(out: Path) -> None:
 
     If this fails (no OpenGL, a diverged replay) a message is printed, and the page has no pictures.
     """
+    if not distributed.first() or not (out / REPLAY).is_file() or (out / FRAMES).is_dir():
+        return
     import mujoco
 
     from droid_jax.model.scene import for_pictures
@@ -94,8 +96,10 @@ def draw_replay(out: Path) -> None:
     from droid_jax.report.viewer import write_viewer
     from droid_jax.storage import new_folder
 
-    if not (distributed.first() and (out / REPLAY).is_file() and (out / FITTED).is_file()) or (out / FRAMES).is_dir():
+    if not (out / FITTED).is_file():
+        print(f"no pictures: there is no {FITTED}, see the notes of the page", file=sys.stderr)
         return
+    of = (out / REPLAY).stat().st_mtime_ns
     try:
         time, before, after = read_replay(out / REPLAY, Reader("identify"))
         model = for_pictures(mujoco.MjModel.from_xml_path(str(out / FITTED)))
@@ -108,6 +112,8 @@ def draw_replay(out: Path) -> None:
     except (NoOpenGL, ValueError) as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
+    if not (out / REPLAY).is_file() or (out / REPLAY).stat().st_mtime_ns != of:
+        return  # of another fit by now
     with new_folder(out / FRAMES) as folder:  # last: it marks that everything is drawn
         save_frames(folder, images, [float(time[r]) for r in rows], "after")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,14 +17,16 @@ import tyro
 from droid_jax import distributed
 from droid_jax.commands.folder import RUNS
 from droid_jax.commands.pictures import draw_replay
+from droid_jax.console import at_the_end
 from droid_jax.files import LAST_FILES
 
-_MEANWHILE: ContextVar[list[subprocess.Popen[bytes]] | None] = ContextVar("processes that draw", default=None)
+Drawing = dict[Path, "subprocess.Popen[str]"]  # folder -> the process that draws its page
+_MEANWHILE: ContextVar[Drawing | None] = ContextVar("processes that draw", default=None)
 
 
 @dataclass(frozen=True)
 class Report:
-    """Build the HTML page of a finished run again."""
+    """Build the HTML page of a finished run again, and draw pictures of its replay that are missing."""
 
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """The run's folder. Default: the one of runs/identify, runs/gap, runs/train and runs/all that was finished last."""
@@ -35,7 +38,8 @@ def run(command: Report) -> None:
     drawing = _MEANWHILE.get()
     if drawing is not None:
         if distributed.first():
-            drawing.append(_report_process(folder))
+            _finish(drawing, folder)  # its page of an earlier stage
+            drawing[folder] = _report_process(folder)
         print(f"report: {folder / 'report.html'} (is being drawn)", flush=True)
         return
     from droid_jax.report.page import write_report
@@ -47,24 +51,48 @@ def run(command: Report) -> None:
 
 @contextlib.contextmanager
 def drawn_meanwhile() -> Iterator[None]:
-    """Pages are drawn by processes of their own, for which this context waits; an error ends them at once."""
-    drawing = list[subprocess.Popen[bytes]]()
+    """Pages are drawn by processes of their own, for which this context waits; a signal ends them too."""
+    drawing = Drawing()
+
+    def end() -> None:
+        for process in drawing.values():
+            process.terminate()
+
     token = _MEANWHILE.set(drawing)
     try:
-        yield
-        for process in drawing:
-            process.wait()
+        with at_the_end(end):
+            yield
+            wait_for_pages()
     finally:
         _MEANWHILE.reset(token)
-        for process in drawing:
-            process.terminate()
-            process.wait()
+        end()
 
 
-def _report_process(folder: Path) -> subprocess.Popen[bytes]:
-    """A process that runs `report` and prints nothing but errors."""
+def wait_for_pages() -> None:
+    """Wait for the processes of `drawn_meanwhile`, and print what they had to say."""
+    drawing = _MEANWHILE.get() or {}
+    for folder in list(drawing):
+        _finish(drawing, folder)
+
+
+def _finish(drawing: Drawing, folder: Path) -> None:
+    """Wait for the process that draws a folder's page, if there is one."""
+    if (process := drawing.get(folder)) is None:
+        return
+    _, said = process.communicate()
+    del drawing[folder]
+    if said or process.returncode:
+        print(f"{folder / 'report.html'}: {said.strip() or 'could not be drawn'}", file=sys.stderr)
+
+
+def _report_process(folder: Path) -> subprocess.Popen[str]:
+    """A process that runs `report`, which no Ctrl-C reaches."""
+    # -P: without it the current folder comes first on the path, where its modules could hide others.
+    package = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
-        [sys.executable, "-m", "droid_jax.run", "report", str(folder)], stdout=subprocess.DEVNULL
+        [sys.executable, "-P", "-m", "droid_jax.run", "report", str(folder)],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace",
+        env={**os.environ, "PYTHONPATH": package}, start_new_session=True,
     )  # fmt: skip
 
 

@@ -78,9 +78,9 @@ def batch_of_episodes(
     """
     drawn, axes = (env.sys, None) if randomise is None else randomise(env.sys, jax.random.split(physics, episodes))
     devices = runtime.devices_mesh()
-    row = np.minimum(np.arange(_rows(episodes, devices.size)), episodes - 1)  # of each episode; the last one fills up
-    rows = PartitionSpec(*devices.axis_names)
-    varied = jax.tree.map(lambda leaf: leaf[row], _varied(axes, drawn))
+    episode = np.minimum(np.arange(_rows(episodes, devices.size)), episodes - 1)  # of each row; the last one fills up
+    split = PartitionSpec(*devices.axis_names)
+    varied = jax.tree.map(lambda leaf: leaf[episode], _varied(axes, drawn))
 
     def run(policy, varied, keys):
         sys: Any = _filled(axes, varied, drawn), axes
@@ -102,13 +102,13 @@ def batch_of_episodes(
         return won, best, steps, grips / jnp.maximum(count, 1.0), state.metrics["blown_up"], rewards
 
     # check_vma: mjx's own loops mix sharded and constant carries, which the check refuses.
-    each = jax.shard_map(
-        run, mesh=devices, in_specs=(PartitionSpec(), rows, rows), out_specs=rows, check_vma=False
+    mapped = jax.shard_map(
+        run, mesh=devices, in_specs=(PartitionSpec(), split, split), out_specs=split, check_vma=False
     )  # fmt: skip
-    program = jax.jit(each, compiler_options=runtime.compiler_options())
+    program = jax.jit(mapped, compiler_options=runtime.compiler_options())
 
     def played(policy: Policy, start: jax.Array) -> Played:
-        found = program(policy, varied, jax.random.split(start, episodes)[row])
+        found = program(policy, varied, jax.random.split(start, episodes)[episode])
         won, angle, steps, grip, blown_up, rewards = (np.asarray(a)[:episodes] for a in found)
         stopped = np.where(blown_up > 0, BLOWN_UP, "")
         trials = Trials(won > 0, angle.astype(float), steps.astype(int), grip.astype(float), stopped)

@@ -37,7 +37,9 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
         if randomise is None:
             return wrap(env, episode_length, action_repeat)
         count = len(randomization_fn.keywords["rng"])  # of environments on one device
-        drawn = RandomisedEnvs(env, randomise, count, devices, jax.random.fold_in(jax.random.PRNGKey(seed), 0))
+        drawn = RandomisedEnvs(
+            env, randomise, count, devices, jax.random.fold_in(jax.random.PRNGKey(seed), 0)
+        )  # 1: evaluations
         return AutoResetWrapper(EpisodeWrapper(drawn, episode_length, action_repeat))
 
     return wrap_env
@@ -96,7 +98,7 @@ class Unused(Wrapper):
 
 
 def device_index() -> jax.Array:
-    """Index of the device on which brax runs this; 0 if it uses one device."""
+    """Index of the device on which brax runs this; 0 outside its map over devices."""
     try:
         return jax.lax.axis_index(AXIS)
     except NameError:  # no mapped axis

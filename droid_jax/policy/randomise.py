@@ -147,7 +147,7 @@ def fixed(scene: Scene, space: Space, values: np.ndarray) -> Randomise:
 def physics_of(scene: Scene, space: Space, values: np.ndarray) -> Physics:
     """Physics of rows of values [N, D], batched along `axes`."""
     count, each = len(values), axes(scene, space)
-    whole = jnp.concatenate([values, jnp.repeat(values[-1:], -count % ROWS, axis=0)])  # the last row fills up
+    whole = values[np.minimum(np.arange(count + -count % ROWS), count - 1)]  # the last row fills up
     make = jax.vmap(lambda row: make_physics(scene, space, row), out_axes=each)
     made = jax.jit(make)(jnp.asarray(whole, jnp.float32))
     return jax.tree.map(

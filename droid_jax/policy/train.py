@@ -45,7 +45,7 @@ class TrainConfig:
     Attributes:
         steps: total number of actions over all environments, rounded up to whole rounds.
         envs: environments in parallel, over all devices.
-        devices: number of devices; None: the most that divide `envs` and `batch`.
+        devices: number of devices for training; None: the most that divide `envs` and `batch`.  Evaluations use all.
         hidden: sizes of the hidden layers of actor and critic.
         learning_rate: of Adam.
         discount: discount factor.
@@ -60,7 +60,8 @@ class TrainConfig:
         evaluations: number of evaluations (each saves a checkpoint) during the training.
         eval_envs: episodes of an evaluation.
         enough: success rate that ends the training,
-        held: if the last evaluation and so many together reach it; 0: the training makes all its steps.
+        held: number of last evaluations whose mean, and the last of which alone, must reach it; 0: the training makes
+            all its steps.
         seed: of all randomness.
 
     Raises:
@@ -233,7 +234,7 @@ def _brax(
     began = time.monotonic() - (history[-1].seconds if history else 0.0)
     best: Any = None
     batch: Any = None  # of episodes, compiled once
-    seed = jax.random.PRNGKey(config.seed)
+    key = jax.random.key(config.seed)
 
     def as_policy(params: Any) -> Policy:
         normaliser, actor, _ = params
@@ -244,8 +245,8 @@ def _brax(
         nonlocal best, batch
         if step and not _finite(params):
             raise _Ended
-        batch = batch or batch_of_episodes(env, randomise, config.eval_envs, jax.random.fold_in(seed, 1))
-        played = batch(as_policy(params), jax.random.fold_in(seed, 2 + done + step))
+        batch = batch or batch_of_episodes(env, randomise, config.eval_envs, jax.random.fold_in(key, 1))
+        played = batch(as_policy(params), jax.random.fold_in(key, 2 + done + step))
         seconds = time.monotonic() - began
         now = TrainProgress(
             step=done + step,
@@ -413,7 +414,10 @@ class replicated:
 
 
 def put_replicated(tree: Any, devices: Any) -> Any:
-    """A copy of every array on every device, [devices, ...], with the type and the place of a result of brax's pmap."""
+    """A copy of every array on every device, [devices, ...], with the type and the place of a result of brax's pmap.
+
+    Then its program is compiled once, for the first call and for later ones.
+    """
 
     def one(_: Any, copied: Any) -> Any:
         # Results have no weak types.

@@ -143,11 +143,11 @@ def rehearsal_sentences(result: Result) -> list[str]:
     if found:
         ranked = sorted([e for e in found if e["unit"] in FAMILIAR_UNITS] or found, key=_multiple)
         first, last = next((e for e in ranked if e["unit"] == "N m"), ranked[0]), ranked[-1]
-        sentence = (
-            f"With this motion {_thing(first)} would be found from {quantity(first['smallest'], first['unit'], 2)}"
-        )
+        promise = result["how"]["rehearsal"].get("promise", 1.0)
+        sizes = [quantity(min(promise * e["smallest"], e["bound"]), e["unit"], 2) for e in (first, last)]
+        sentence = f"With this motion {_thing(first)} would surely be found from {sizes[0]}"
         if last is not first:
-            sentence += f", {_thing(last)} only from {quantity(last['smallest'], last['unit'], 2)}"
+            sentence += f", {_thing(last)} only from {sizes[1]}"
         out.append(f"{sentence}.")
     else:
         out.append("With this motion no effect would surely be found.")
@@ -234,6 +234,7 @@ def how_sentences(result: Result) -> list[str]:
         "Then each effect was simulated at the size that is found. An effect whose law has a shape was also simulated "
         "with the law of the synthetic robot. Doubtful: the library's effect explains less than "
         f"{percent(how['rehearsal'].get('known', 0.5))} of that residual, or another effect explains clearly more.",
+        f"The first sentence adds a factor of {how['rehearsal'].get('promise', 1.0):g} to the sizes of the table.",
         f"Recovered means that the posterior width is less than {percent(how['recovered_below'])} of the prior's.",
     ]
     if not result.get("full"):

@@ -15,11 +15,9 @@ variables, so that the same drawing is readable on a dark page.
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import io
 import itertools
-import json
 import math
 import pickle
 import re
@@ -27,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any, ParamSpec, cast
+from typing import Any, ParamSpec, TypedDict, cast
 
 import matplotlib
 from markupsafe import Markup
@@ -39,6 +37,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import ScalarFormatter
 
+from droid_jax.read_json import read_json, typed
 from droid_jax.storage import write_bytes, write_json
 
 WIDE = 9.2  # inches: a desk, paper
@@ -268,16 +267,17 @@ class Drawing:
 def drawing(folder: Path, stem: str, title: str, make: Callable[..., Figure], *args: Any) -> Drawing:
     """The figure `make(*args, width=...)` draws, for the page; PNG and PDF copies go to FOLDER/figures/STEM.*.
 
-    STEM.json there keeps the page's HTML, which is used again as long as the data and this package are the same.
+    STEM.json there keeps the page's HTML, which is used again as long as the data and the modules that draw are the
+    same.
     """
     of, path = _content(title, make, args), folder / "figures" / f"{stem}.json"
     if of and (kept := _kept(path, of)):
-        return Drawing(path.parent, stem, title, *kept)
+        return Drawing(path.parent, stem, title, *map(Markup, kept))
     wide, narrow = (settled(make(*args, width=width)) for width in (WIDE, NARROW))
     save(wide, folder / "figures", stem)
     html = [_inline(f, stem, kind, title) for kind, f in (("wide", wide), ("narrow", narrow))]
     if of:
-        write_json(path, {"of": of, "html": html})
+        write_json(path, {"of": of, "whole": _whole(path, html), "html": html})
     return Drawing(path.parent, stem, title, *html)
 
 
@@ -300,15 +300,28 @@ def _sources() -> bytes:
     return hashlib.sha256(b"".join([matplotlib.__version__.encode(), *texts])).digest()
 
 
-def _kept(path: Path, of: str) -> tuple[Markup, Markup] | None:
-    """HTML of an earlier drawing of the same content; None if there is none, or its copies are missing."""
-    if not all(path.with_suffix(kind).is_file() for kind in (".json", ".png", ".pdf")):
+class _Kept(TypedDict):
+    """STEM.json: hashes of what was drawn, and of the drawing with its copies."""
+
+    of: str
+    whole: str
+    html: tuple[str, str]
+
+
+def _kept(path: Path, of: str) -> tuple[str, str] | None:
+    """HTML of an earlier drawing of the same content; None if there is none, or it or its copies are damaged."""
+    try:
+        kept = typed(read_json(path), _Kept, path.name)
+        same = (kept["of"], kept["whole"]) == (of, _whole(path, kept["html"]))
+    except (OSError, ValueError):
         return None
-    with contextlib.suppress(ValueError, OSError, KeyError, TypeError):  # damaged: it is drawn again
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        wide, narrow = kept["html"]
-        return (Markup(wide), Markup(narrow)) if kept["of"] == of else None
-    return None
+    return kept["html"] if same else None
+
+
+def _whole(path: Path, html: Sequence[str]) -> str:
+    """A hash of a drawing's HTML and of its copies."""
+    copies = [path.with_suffix(kind).read_bytes() for kind in (".png", ".pdf")]
+    return hashlib.sha256(b"".join([*(text.encode() for text in html), *copies])).hexdigest()
 
 
 def _inline(figure: Figure, stem: str, kind: str, title: str) -> Markup:

@@ -19,7 +19,7 @@ from droid_jax.door.space import door_space
 from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
 from droid_jax.policy.control import SHAPES, Interface, Policy
-from droid_jax.policy.evaluate import simulated
+from droid_jax.policy.evaluate import batch_of_episodes, simulated
 from droid_jax.policy.randomise import randomised
 
 
@@ -48,7 +48,7 @@ class Opening(Env):
     def step(self, state, action):
         angle = self.sys.width + self.sys.height + action[0]
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            metrics={**state.metrics, "angle": angle}
+            reward=angle, metrics={**state.metrics, "angle": angle}
         )
 
 
@@ -68,6 +68,9 @@ def test_outcomes_do_not_depend_on_the_devices(monkeypatch: pytest.MonkeyPatch, 
     env: Any = Opening()
     assert len(jax.local_devices()) > 1
     many = simulated(network(0.5), env, draws, episodes)
+    physics = jax.random.split(jax.random.key(0))[1]
+    played = batch_of_episodes(env, draws, episodes, physics)(network(0.5), jax.random.key(1))
+    assert played.reward == pytest.approx(2 * many.angle.mean())  # of two steps
     monkeypatch.setattr(runtime, "devices_mesh", lambda: jax.sharding.Mesh(np.array(jax.local_devices()[:1]), ("a",)))
     one = simulated(network(0.5), env, draws, episodes)
     assert many.angle.shape == (episodes,) and len(np.unique(many.angle)) == episodes
@@ -89,9 +92,10 @@ def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.M
 
     monkeypatch.setattr(jax, "jit", spied)
     env: Any = Opening()
-    found = [simulated(network(weight), env, draws, 3, seed) for weight, seed in ((0.5, 0), (0.2, 1))]
-    assert programs[0] == programs[1]
-    widths = [trials.angle - 1.0 - np.tanh(weight) for trials, weight in zip(found, (0.5, 0.2), strict=True)]
+    cases = ((0.5, 0, 3), (0.2, 1, 3), (0.5, 0, 70), (0.5, 0, 100))  # the last two have 64 rows on each of two devices
+    found = [simulated(network(weight), env, draws, count, seed) for weight, seed, count in cases]
+    assert programs[0] == programs[1] != programs[2] == programs[3]
+    widths = [trials.angle - 1.0 - np.tanh(weight) for trials, weight in zip(found[:2], (0.5, 0.2), strict=True)]
     assert len(np.unique(np.round(widths, 5))) == 6 and np.min(widths) > 0 and np.max(widths) < 1
     alone = simulated(network(0.5), env, None, 2)
     np.testing.assert_allclose(alone.angle, 1.0 + np.tanh(0.5), rtol=1e-6)

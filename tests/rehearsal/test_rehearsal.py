@@ -32,7 +32,7 @@ from droid_jax.model.parameters import Parameter, Space
 from droid_jax.model.scene import Scene, load_scene
 from droid_jax.recordings.formats import save_recording
 from droid_jax.recordings.recording import Channel, Recording, TorqueConvention, TorqueSide
-from droid_jax.rehearsal.config import RehearsalConfig
+from droid_jax.rehearsal.config import DEFAULT_REHEARSAL, RehearsalConfig
 from droid_jax.rehearsal.full import (
     FullRehearsal,
     HiddenCase,
@@ -49,6 +49,7 @@ from droid_jax.rehearsal.plan import RehearsalPlan, faster_motion, sample_noise
 from droid_jax.rehearsal.power import _some_flips, smallest_sizes
 from droid_jax.rehearsal.quick import _of_longer_log, quick_rehearsal
 from droid_jax.report.rehearsal_page import rehearsal_sentences
+from droid_jax.report.text import quantity
 from droid_jax.run import main
 
 REPEATS, LENGTH, DIRECTIONS, BASE = 10, 160, 12, 4
@@ -258,6 +259,16 @@ def test_an_effect_whose_other_law_looks_like_another_effect_is_doubtful(result)
     assert any("over centre spring" in s and "not named" in s for s in rehearsal_sentences(plain(result)))
 
 
+def test_the_first_sentence_promises_more_than_the_smallest_size(result):
+    shown = plain(result)
+    first = rehearsal_sentences(shown)[0]
+    sizes = [e["smallest"] for e in shown["effects"] if e["smallest"] is not None and e["unit"] == "N m"]
+    assert any(f"from {quantity(DEFAULT_REHEARSAL.promise * size, 'N m', 2)}" in first for size in sizes)
+    assert not any(f"from {quantity(size, 'N m', 2)}" in first for size in sizes)
+    of_before = {**shown, "how": {**shown["how"], "rehearsal": {}}}  # without the factor
+    assert any(f"from {quantity(size, 'N m', 2)}" in rehearsal_sentences(of_before)[0] for size in sizes)
+
+
 def test_one_batch_gives_the_jacobian_of_two_batches():
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(7, 2))
@@ -345,16 +356,27 @@ def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[
 
 
 def test_advice_is_wrong_if_an_effect_was_not_found():
-    usual = {"within": True, "not_found_at_twice": False, "missed": False, "found": {"1": [1, 1]}}
+    """At the size that the page promises; a miss at the predicted size alone is counted apart."""
+    usual = {"within": True, "not_found_at_twice": False, "found": {"1": [1, 1]}}
+    usual |= {"missed": False, "missed_at_promised": False}
     of = [
         {**usual, "sure": True, "measured_over_predicted": 0.7},
         {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
-        {**usual, "sure": False, "missed": True, "not_found_at_twice": True, "within": False},
+        {**usual, "sure": True, "missed": True, "missed_at_promised": True, "within": None, "found": {"2": [0, 1]}},
+        {
+            **usual,
+            "sure": False,
+            "missed": True,
+            "missed_at_promised": True,
+            "not_found_at_twice": True,
+            "within": False,
+        },
     ]
     result = summary({"hinge": of})
     assert (
-        result["wrong_advice_rate"] == 0.5
-        and result["advised"] == 2
+        result["wrong_advice_rate"] == pytest.approx(1 / 3)
+        and result["missed_at_predicted_rate"] == pytest.approx(2 / 3)
+        and result["advised"] == 3
         and result["within_factor"] == pytest.approx(2 / 3)
     )
     assert result["within_factor_of_sure"] == 1.0 and result["unsure_not_found"] == 1

@@ -439,7 +439,7 @@ def test_the_page_loads_nothing_and_every_link_is_there(tmp_path: Path, verdict:
     assert not [link for link in written.links if not (folder / link).is_file()]
     stems = {"gap", "cells", "state", "torque_train", "torque_validation", "torque_test"}
     stems |= {"shifts", "remainder"} if verdict == "partly explained" else set()
-    names = {f"missing_{s}.{kind}" for s in stems for kind in ("png", "pdf")}
+    names = {f"missing_{s}.{kind}" for s in stems for kind in ("png", "pdf", "json")}
     assert {p.name for p in (folder / "figures").iterdir()} == names
 
 

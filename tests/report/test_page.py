@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -185,9 +186,9 @@ def test_a_figure_is_drawn_again_only_for_other_content(tmp_path: Path):
     assert other != first and len(drawn) == 4
     (tmp_path / "figures" / "curve.json").write_text("{")
     assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 6
-    (tmp_path / "figures" / "curve.png").unlink()
+    (tmp_path / "figures" / "curve.png").write_bytes(b"cut")
     assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 8
-    assert (tmp_path / "figures" / "curve.png").is_file()
+    assert (tmp_path / "figures" / "curve.png").stat().st_size > 100
     style.drawing(tmp_path, "curve", "Curve", lambda height, width: curve(height, width), 2.0)  # cannot be pickled
     assert len(drawn) == 10
 
@@ -202,15 +203,44 @@ def test_pages_of_stages_are_drawn_by_processes_of_their_own(tmp_path: Path, cap
     assert "being drawn" not in capsys.readouterr().out
 
 
-def test_an_error_ends_the_drawing_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    started = list[subprocess.Popen[bytes]]()
+def test_what_the_drawing_process_says_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """At the latest at the end; an error of a stage waits for it too."""
+    with pytest.raises(ValueError, match="of a stage"), report.drawn_meanwhile():
+        report.run(report.Report(tmp_path / "nothing"))
+        report.wait_for_pages()
+        assert "report.html: error: " in capsys.readouterr().err
+        raise ValueError("of a stage")
 
-    def endless(folder: Path) -> subprocess.Popen[bytes]:
-        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]))
-        return started[0]
 
-    monkeypatch.setattr(report, "_report_process", endless)
-    with pytest.raises(KeyboardInterrupt), report.drawn_meanwhile():
-        report.run(report.Report(tmp_path))
-        raise KeyboardInterrupt
-    assert started[0].poll() is not None
+def test_a_signal_ends_the_drawing_too(tmp_path: Path):
+    """The program ends at once, and so does the process that it began."""
+    code = f"""
+import subprocess, sys, time
+from pathlib import Path
+from droid_jax import console
+from droid_jax.commands import report
+
+def endless(folder):
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    print(process.pid, flush=True)
+    return process
+
+report._report_process = endless
+console._watch_signals()
+with report.drawn_meanwhile():
+    report.run(report.Report(Path({str(tmp_path)!r})))
+    time.sleep(600)
+"""
+    program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert program.stdout is not None
+    drawing = int(program.stdout.readline())
+    program.stdout.readline()  # the page is being drawn
+    program.terminate()
+    _, said = program.communicate(timeout=30)
+    assert program.returncode == 143 and said == "terminated\n"
+    for _ in range(100):
+        state = Path(f"/proc/{drawing}/stat")
+        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.1)
+    raise AssertionError("it still runs")
