@@ -245,7 +245,7 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
     steps = sorted({round(c["size"] / entry["smallest"], 3) for c in cases})
     rates = {t: [bool(c["found"]) for c in cases if round(c["size"] / entry["smallest"], 3) == t] for t in steps}
     ratio = measured_size(entry, cases)
-    promised = min(DEFAULT_REHEARSAL.promise, entry["bound"] / entry["smallest"])  # times the predicted size
+    promise = DEFAULT_REHEARSAL.promise
     return {
         "effect": entry["effect"],
         "location": entry["location"],
@@ -259,7 +259,8 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
         "measured_over_predicted": None if ratio is None or not np.isfinite(ratio) else ratio,
         "not_found_at_twice": bool(ratio == np.inf),
         "missed": any(t > CLOSE and not all(f) for t, f in rates.items()),
-        "missed_at_promised": any(t > CLOSE * promised and not all(f) for t, f in rates.items()),
+        "promised": promise * entry["smallest"] <= entry["bound"],
+        "missed_at_promised": any(t > CLOSE * promise and not all(f) for t, f in rates.items()),
         "within": None if ratio is None else bool(1 / FACTOR <= ratio <= FACTOR),
         "answers": [c["sentence"] if "sentence" in c else c["error"] for c in cases],
     }
@@ -268,11 +269,11 @@ def judged(entry: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> dict
 def summary(by_scene: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
     """Shares over the effects whose smallest size is known.
 
-    Wrong advice: an effect predicted to be surely found was not found at the promised size (`RehearsalConfig.promise`)
-    or above.
+    Wrong advice: an effect that would surely be found was not found at the promised size (`RehearsalConfig.promise`) or
+    above.  Nothing is promised beyond the bounds of the search.
     """
     done = [e for effects in by_scene.values() for e in effects if e["within"] is not None]
-    every = [e for effects in by_scene.values() for e in effects if e["sure"]]
+    every = [e for effects in by_scene.values() for e in effects if e["sure"] and e["promised"]]
     advised = [e for e in every if e["within"] is not None or any(float(t) > CLOSE for t in e["found"])]
     sure = [e for e in done if e["sure"]]
     return {

@@ -34,8 +34,8 @@ class RehearsalConfig:
       measurement.
     margin: factor on the size that the linear model predicts.  Four of ten effects on a single hinge were found at 1.4
       times that size and not at it, since the parameters and laws of another robot differ from the linear model.
-    promise: factor on the smallest size from which the page's first sentence says that an effect would be found.  Of 31
-      effects of two robots five were missed at the smallest size, and one of these at 1.4 times that.
+    promise: factor on the smallest size from which the page says that an effect would surely be found; of an effect
+      whose bound is smaller it says that it would not.
     known: share of the unabsorbed part of an effect that the library's law must explain for the effect to be found.
     faster: speed of the faster motion, over that of the given one.
     samples, sample_length: number and length, s, of the windows of long logs of held joints (`WindowConfig`); the

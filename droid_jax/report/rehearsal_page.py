@@ -136,15 +136,16 @@ def full_rows(result: Result) -> list[tuple[str, ...]]:
 def rehearsal_sentences(result: Result) -> list[str]:
     """Sentences that the user can act on, the most important first."""
     best = best_of(result)
+    promise = result["how"]["rehearsal"].get("promise", 1.0)
     found = [e for e in best if e["smallest"] is not None and _sure(e)]
+    promised = [e for e in found if promise * e["smallest"] <= e["bound"]]
     doubtful = [e for e in best if e["smallest"] is not None and not _sure(e)]
     lost = [e for e in best if e["smallest"] is None]
     out = []
-    if found:
-        ranked = sorted([e for e in found if e["unit"] in FAMILIAR_UNITS] or found, key=_multiple)
+    if promised:
+        ranked = sorted([e for e in promised if e["unit"] in FAMILIAR_UNITS] or promised, key=_multiple)
         first, last = next((e for e in ranked if e["unit"] == "N m"), ranked[0]), ranked[-1]
-        promise = result["how"]["rehearsal"].get("promise", 1.0)
-        sizes = [quantity(min(promise * e["smallest"], e["bound"]), e["unit"], 2) for e in (first, last)]
+        sizes = [quantity(promise * e["smallest"], e["unit"], 2) for e in (first, last)]
         sentence = f"With this motion {_thing(first)} would surely be found from {sizes[0]}"
         if last is not first:
             sentence += f", {_thing(last)} only from {sizes[1]}"
@@ -160,6 +161,8 @@ def rehearsal_sentences(result: Result) -> list[str]:
     )
     if doubtful:
         out.append(f"These would be seen, but probably not named correctly: {_doubts(doubtful)}.")
+    if at_bounds := [e for e in found if e not in promised]:
+        out.append(f"Only close to the bounds of the search, and so not surely: {_by_effect(at_bounds, best)}.")
     if lost:
         out.append(f"At no size: {_by_effect(lost, best)}.")
     if alike := _alike(found):

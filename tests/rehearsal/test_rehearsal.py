@@ -265,6 +265,9 @@ def test_the_first_sentence_promises_more_than_the_smallest_size(result):
     sizes = [e["smallest"] for e in shown["effects"] if e["smallest"] is not None and e["unit"] == "N m"]
     assert any(f"from {quantity(DEFAULT_REHEARSAL.promise * size, 'N m', 2)}" in first for size in sizes)
     assert not any(f"from {quantity(size, 'N m', 2)}" in first for size in sizes)
+    bounded = [{**e, "bound": e["smallest"] or e["bound"]} for e in shown["effects"]]  # found at the bound itself
+    said = rehearsal_sentences({**shown, "effects": bounded})
+    assert "no effect would surely be found" in said[0] and any("close to the bounds" in s for s in said)
     of_before = {**shown, "how": {**shown["how"], "rehearsal": {}}}  # without the factor
     assert any(f"from {quantity(size, 'N m', 2)}" in rehearsal_sentences(of_before)[0] for size in sizes)
 
@@ -358,7 +361,7 @@ def test_the_measured_size_is_the_smallest_from_which_all_are_found(found: dict[
 def test_advice_is_wrong_if_an_effect_was_not_found():
     """At the size that the page promises; a miss at the predicted size alone is counted apart."""
     usual = {"within": True, "not_found_at_twice": False, "found": {"1": [1, 1]}}
-    usual |= {"missed": False, "missed_at_promised": False}
+    usual |= {"missed": False, "missed_at_promised": False, "promised": True}
     of = [
         {**usual, "sure": True, "measured_over_predicted": 0.7},
         {**usual, "sure": True, "measured_over_predicted": 1.4, "missed": True},
@@ -371,6 +374,7 @@ def test_advice_is_wrong_if_an_effect_was_not_found():
             "not_found_at_twice": True,
             "within": False,
         },
+        {**usual, "sure": True, "missed": True, "promised": False, "within": None},
     ]
     result = summary({"hinge": of})
     assert (

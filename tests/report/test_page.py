@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 from made_up_gap import make_gap
 from made_up_run import make_policy, make_run, make_whole
-from matplotlib.figure import Figure
 from reader import Page, read_page, spaced
 
 from droid_jax.commands import report
-from droid_jax.report import page, style
+from droid_jax.report import page
 from droid_jax.synthetic.hidden_effects import in_words
 
 
@@ -165,32 +164,6 @@ def test_a_stage_alone_has_no_lead(tmp_path: Path, quick: None):
 )
 def test_what_was_hidden_is_called_as_the_library_does_there(hidden: str, called: str):
     assert f"in the library: {called})" in in_words([hidden])
-
-
-drawn = list[float]()
-
-
-def curve(height: float, width: float) -> Figure:
-    drawn.append(height)
-    figure = Figure((width, 1.0))
-    figure.subplots().plot([0.0, height])
-    return figure
-
-
-def test_a_figure_is_drawn_again_only_for_other_content(tmp_path: Path):
-    """Its copies and its HTML are kept beside the page; what is damaged or missing is drawn again."""
-    drawn.clear()
-    first = style.drawing(tmp_path, "curve", "Curve", curve, 1.0)
-    assert style.drawing(tmp_path, "curve", "Curve", curve, 1.0) == first and drawn == [1.0, 1.0]  # wide and narrow
-    other = style.drawing(tmp_path, "curve", "Curve", curve, 2.0)
-    assert other != first and len(drawn) == 4
-    (tmp_path / "figures" / "curve.json").write_text("{")
-    assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 6
-    (tmp_path / "figures" / "curve.png").write_bytes(b"cut")
-    assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 8
-    assert (tmp_path / "figures" / "curve.png").stat().st_size > 100
-    style.drawing(tmp_path, "curve", "Curve", lambda height, width: curve(height, width), 2.0)  # cannot be pickled
-    assert len(drawn) == 10
 
 
 def test_pages_of_stages_are_drawn_by_processes_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

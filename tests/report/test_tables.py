@@ -1,4 +1,4 @@
-"""Tables, and numbers as text."""
+"""Tables, numbers as text, and figures that are kept."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 import droid_jax as dj
+from droid_jax.report import style
 from droid_jax.report.text import label, like, percent, quantity, significant, speak, spelled, unbroken, unit_text
 from droid_jax.storage import write_csv
 
@@ -114,3 +116,29 @@ def test_identifiers_and_units_are_spelled() -> None:
 def test_a_simulation_is_never_called_a_robot(robot: str, said: str) -> None:
     assert speak("the robot", robot) == said and speak("Robot", robot).lower() == said.removeprefix("the ")
     assert speak("a synthetic robot", robot) == "a synthetic robot"
+
+
+drawn = list[float]()
+
+
+def curve(height: float, width: float) -> Figure:
+    drawn.append(height)
+    figure = Figure((width, 1.0))
+    figure.subplots().plot([0.0, height])
+    return figure
+
+
+def test_a_figure_is_drawn_again_only_for_other_content(tmp_path: Path):
+    """Its copies and its HTML are kept beside the page; what is damaged or missing is drawn again."""
+    drawn.clear()
+    first = style.drawing(tmp_path, "curve", "Curve", curve, 1.0)
+    assert style.drawing(tmp_path, "curve", "Curve", curve, 1.0) == first and drawn == [1.0, 1.0]  # wide and narrow
+    other = style.drawing(tmp_path, "curve", "Curve", curve, 2.0)
+    assert other != first and len(drawn) == 4
+    (tmp_path / "figures" / "curve.json").write_text("{")
+    assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 6
+    (tmp_path / "figures" / "curve.png").write_bytes(b"cut")
+    assert style.drawing(tmp_path, "curve", "Curve", curve, 2.0) == other and len(drawn) == 8
+    assert (tmp_path / "figures" / "curve.png").stat().st_size > 100
+    style.drawing(tmp_path, "curve", "Curve", lambda height, width: curve(height, width), 2.0)  # cannot be pickled
+    assert len(drawn) == 10
