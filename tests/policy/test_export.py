@@ -176,3 +176,20 @@ def test_brax_gets_one_environment_for_each_of_its_keys():
     assert env.reset(keys).obs.shape == (COUNT, 3)
     alike = wrapped(None, 2, 1)(Spring(), 10, 1, None)
     np.testing.assert_array_equal(alike.reset(keys).obs[:, 2], np.zeros(COUNT))
+
+
+@pytest.mark.parametrize("drawn", [None, randomise])
+def test_episodes_of_a_training_begin_in_different_phases(drawn: Any):
+    """The first ones are shorter, all later ones whole."""
+    length, many = 10, 64
+    keys = jax.random.split(jax.random.PRNGKey(0), many)
+    env = wrapped(drawn, 1, 1)(Spring(), length, 1, partial(randomise, rng=keys))
+    state, done = env.reset(keys), list[np.ndarray]()
+    phase = np.asarray(state.info["steps"])
+    assert set(phase.astype(int)) == set(range(length))
+    for _ in range(3 * length):
+        state = env.step(state, jnp.zeros(many))
+        done.append(np.asarray(state.done))
+    ended = np.array(done).T > 0
+    np.testing.assert_array_equal(ended.argmax(axis=1), length - 1 - phase)
+    assert all((np.diff(np.flatnonzero(row)) == length).all() for row in ended)
