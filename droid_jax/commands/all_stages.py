@@ -53,7 +53,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.5, "identify": 2.1, "gap": 4.2, "train": 4.2, "evaluate": 1.5}
+MINUTES = {"record": 0.4, "identify": 2.6, "gap": 2.7, "train": 2.3, "evaluate": 1.1}
 """Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
@@ -66,7 +66,7 @@ class All:
     """
 
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """quick: preset quick in identify, gap and train; half an hour on a laptop.  paper: standard in identify and gap
+    """quick: preset quick in identify, gap and train; ten minutes on two fast cores.  paper: standard in identify and gap
     (100 generations; no policy can be trained with the servo of identify's preset paper), paper in train; hours.  gpu:
     gpu in all stages."""
     recording: tuple[Path, ...] = ()

@@ -10,12 +10,10 @@ import droid_jax.model.quiet_mjx  # noqa: F401  brax would import mujoco.mjx wit
 
 # isort: split
 import contextlib
-import copy
 import functools
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +31,7 @@ from droid_jax.arguments import check_fields, number, optional, several, whole
 from droid_jax.identify.checkpoints import Checkpoints
 from droid_jax.policy.control import LAYOUT, Policy
 from droid_jax.policy.environment import Environment
-from droid_jax.policy.evaluate import Played, batch_of_episodes
+from droid_jax.policy.evaluate import batch_of_episodes
 from droid_jax.policy.network import layer_sizes, policy_of
 from droid_jax.policy.parallel import AXIS, wrapped
 from droid_jax.policy.randomise import Randomise
@@ -235,22 +233,22 @@ def _brax(
     history = [TrainProgress(int(row[0]), *row[1:]) for row in tree["history"].tolist()] if tree else []
     began = time.monotonic() - (history[-1].seconds if history else 0.0)
     best: Any = None
-    first: Any = None  # evaluation, before the first update
+    batch: Any = None  # of episodes, compiled once
     key = jax.random.key(config.seed)
-
-    @functools.cache
-    def batch() -> Callable[[Policy, jax.Array], Played]:
-        """Episodes of a policy, compiled once; of a copy of the environment, since tracing changes its physics."""
-        return batch_of_episodes(copy.copy(env), randomise, config.eval_envs, jax.random.fold_in(key, 1))
 
     def as_policy(params: Any) -> Policy:
         normaliser, actor, _ = params
         return policy_of(normaliser, actor, layer_sizes(config.hidden), env.interface)
 
-    def evaluated(step: int, policy: Policy) -> TrainProgress:
-        played = batch()(policy, jax.random.fold_in(key, 2 + done + step))
+    def updated(step: int, _: Any, params: Any) -> None:
+        """Evaluate brax's parameters after `step` actions; 0 is before the first, or at the checkpoint."""
+        nonlocal best, batch
+        if step and not _finite(params):
+            raise _Ended
+        batch = batch or batch_of_episodes(env, randomise, config.eval_envs, jax.random.fold_in(key, 1))
+        played = batch(as_policy(params), jax.random.fold_in(key, 2 + done + step))
         seconds = time.monotonic() - began
-        return TrainProgress(
+        now = TrainProgress(
             step=done + step,
             of=config.steps,
             seconds=seconds,
@@ -259,21 +257,11 @@ def _brax(
             success=float(played.trials.success.mean()),
             blown_up=float((played.trials.stopped == BLOWN_UP).mean()),
         )
-
-    def updated(step: int, _: Any, params: Any) -> None:
-        """Evaluate brax's parameters after `step` actions; 0 is before the first, or at the checkpoint."""
-        nonlocal best, first
-        if not step:  # its program compiles while brax compiles an update
-            first = pool.submit(evaluated, 0, as_policy(params))
-            return
-        if first is not None:
-            begin, first = first.result(), None
-            progress(begin)
-            history.extend([] if history else [begin])
-        if not _finite(params):
-            raise _Ended
-        now = evaluated(step, as_policy(params))
         progress(now)
+        if not step:
+            if not history:
+                history.append(now)
+            return
         if best is None or _rank(now) >= max(_rank(h) for h in history if h.step):
             best = params
         history.append(now)
@@ -282,7 +270,7 @@ def _brax(
         if _held(history, config):
             raise _Ended
 
-    with replicated(), ThreadPoolExecutor(1) as pool:
+    with replicated():
         params: Any = None
         if tree is not None:
             blank = _blank(env, config)

@@ -124,9 +124,8 @@ def played(monkeypatch: pytest.MonkeyPatch, *evaluations: tuple[int, float, floa
 
     def batch(env, randomise, episodes, physics):
         def played(policy, start):
-            assert np.isfinite(policy), "weights that are no numbers are not evaluated"
-            (of_weight,) = {row[1:3] for row in evaluations if row[3] == policy}  # the first one runs in a thread
-            success, reward = of_weight
+            _, success, reward, weight = evaluations[len(ran) - 1]
+            assert np.isfinite(weight), "weights that are no numbers are not evaluated"
             nothing, blown_up = np.zeros(4), np.array([BLOWN_UP, "", "", ""])
             return Played(Trials(np.full(4, success), nothing, nothing, nothing, blown_up), reward)
 
