@@ -29,8 +29,9 @@ import json  # noqa: E402
 import shutil  # noqa: E402
 import subprocess  # noqa: E402
 import time  # noqa: E402
+from collections.abc import Sequence  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
-from typing import Any  # noqa: E402
+from typing import Any, Literal  # noqa: E402
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
@@ -66,6 +67,8 @@ class Arguments:
     """Folder with bam_xl330, go2_leg and so101; without it the real logs are left out."""
     problems: tuple[str, ...] = ()
     """Only these problems; default: all with data."""
+    programs: tuple[Literal["ours", "sysid", "cma_es"], ...] = ("ours", "sysid", "cma_es")
+    """Only these programs; ours and sysid must be among them.  CMA-ES takes an hour on the SO-101."""
     quick: bool = False
     """The spring, and two seconds of the leg if its data exist; its numbers are not to be reported."""
     out: Path = ROOT / "benchmarks" / "results"
@@ -190,9 +193,9 @@ def heldout(name: str, folder: Path, found: dict[str, dict[str, Any]]) -> dict[s
     return out
 
 
-def figures(name: str, folder: Path) -> dict[str, Any]:
-    """All programs on one problem."""
-    found = {program: fitted(name, program, folder) for program in PROGRAMS}
+def figures(name: str, folder: Path, programs: Sequence[str]) -> dict[str, Any]:
+    """These programs on one problem."""
+    found = {program: fitted(name, program, folder) for program in programs}
     left = heldout(name, folder, found)
     out: dict[str, Any] = {
         program: {
@@ -219,6 +222,8 @@ def _inside(folder: Path, one: dict[str, Any]) -> list[int]:
 def main(arguments: Arguments) -> None:
     """All programs on all problems; other problems in peers.json are kept."""
     every = (*SYNTHETIC, *REAL)
+    if missing := {"ours", "sysid"} - {*arguments.programs}:
+        raise SystemExit(f"error: --programs lacks {', '.join(sorted(missing))}, whose times are compared")
     if unknown := [p for p in arguments.problems if p not in every]:
         raise SystemExit(f"error: no problem {', '.join(unknown)}; there are {', '.join(every)}")
     usual = ("spring", "go2") if arguments.quick else every
@@ -229,7 +234,7 @@ def main(arguments: Arguments) -> None:
     for name in arguments.problems or [p for p in usual if p in SYNTHETIC or arguments.data is not None]:
         print(f"{name} ...", flush=True)
         prepared(name, arguments, runs / name)
-        known[name] = figures(name, runs / name)
+        known[name] = figures(name, runs / name, arguments.programs)
         print(json.dumps(known[name]), flush=True)
     publish(arguments.out, "peers", arguments.quick, 0, {"programs": list(PROGRAMS), **known})
 
