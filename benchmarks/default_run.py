@@ -154,7 +154,7 @@ def main() -> None:
         found: dict[str, Any] = {"help_s": help_seconds(), **figures(lines), **({} if quick else results(out))}
         found["printed"] = [[round(line.seconds, 1), line.text] for line in lines]
         paired = dict[str, Any]()
-        write_json(written, found)  # each run takes half an hour or more: what is there stays
+        write_json(written, found)  # each run takes long: what is there stays
         if other is not None:
             paired["against"] = of_another_commit(other, out, quick)
             write_json(written, found | paired | ratios(found, paired))

@@ -48,6 +48,7 @@ from droid_jax.identify.evaluation import evaluate_on  # noqa: E402
 from droid_jax.identify.holdout import split_repeats  # noqa: E402
 from droid_jax.recordings.formats import load_recording, save_recording  # noqa: E402
 from droid_jax.recordings.recording import Recording  # noqa: E402
+from droid_jax.runtime import git_commit  # noqa: E402
 from droid_jax.storage import write_json  # noqa: E402
 from droid_jax.synthetic.robot import synthetic_truth  # noqa: E402
 
@@ -234,7 +235,7 @@ def main(arguments: Arguments) -> None:
     for name in arguments.problems or [p for p in usual if p in SYNTHETIC or arguments.data is not None]:
         print(f"{name} ...", flush=True)
         prepared(name, arguments, runs / name)
-        known[name] = figures(name, runs / name, arguments.programs)
+        known[name] = {"commit": git_commit(ROOT), **figures(name, runs / name, arguments.programs)}
         print(json.dumps(known[name]), flush=True)
     publish(arguments.out, "peers", arguments.quick, 0, {"programs": list(PROGRAMS), **known})
 

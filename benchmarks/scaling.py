@@ -112,11 +112,11 @@ def _door(at: dict[str, Any]) -> tuple[Any, Any, list[Any], tuple[Any, ...]]:
     from droid_jax.synthetic.robot import SyntheticRobotConfig, record, synthetic_truth
 
     scene, demonstration = ready(door_scene(timestep=TIMESTEP)), load_recording(demonstration_path("A"))
-    if at["duration"]:
-        begin = float(demonstration.time[0])
-        demonstration = demonstration.window(begin, begin + at["duration"])
     truth = synthetic_truth(scene, 1, 0)
     one = record(scene, demonstration, truth, seed=0, config=SyntheticRobotConfig(repeats=2))
+    if at["duration"]:
+        begin = float(one.time[0])
+        one = one.window(begin, begin + at["duration"])
     effects = library(scene)[: int(at["effects"])]
     space = door_space(scene) + door_nuisances(scene)
     if effects:

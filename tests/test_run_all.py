@@ -40,8 +40,6 @@ def called(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list
     monkeypatch.chdir(tmp_path)
     for module in (identify, gap, train, evaluate):
         monkeypatch.setattr(module, "run", commands.append)
-    monkeypatch.setattr(gap, "prepared", lambda command: pytest.fail("the stages' commands are not run"))
-    monkeypatch.setattr(all_stages, "_idle_core", lambda command: False)
     monkeypatch.setattr(synthetic, "kept_recordings", lambda paths, again, record: dict.fromkeys(paths))
     monkeypatch.setattr(page, "write_report", lambda folder: folder / "report.html")
     return commands
@@ -96,32 +94,6 @@ def found(folder: Path, effects: list[str], synthetic_robot: bool = True) -> Non
     )
 
 
-@pytest.mark.parametrize("idle", [False, True])
-def test_the_case_of_the_search_is_prepared_during_the_fit(called, monkeypatch: pytest.MonkeyPatch, idle: bool):
-    made, searched = list[Any](), list[Any]()
-    monkeypatch.setattr(gap, "prepared", lambda command: made.append(command) or "the case")
-    monkeypatch.setattr(gap, "run", lambda command, **known: searched.append((command, known)))
-    monkeypatch.setattr(all_stages, "_idle_core", lambda command: idle)
-    assert main(["--stages", "identify", "gap"]) == 0
-    ((command, known),) = searched
-    if idle:
-        assert made == [replace(command, fit=None)] and known["known"]() == "the case"
-    else:
-        assert not made and not known
-
-
-def test_a_finished_fit_leaves_nothing_to_prepare(tuned: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr("droid_jax.runtime.cores", lambda: 2)
-    asked = all_stages.All(out=tmp_path)
-    assert all_stages._idle_core(asked)
-    (tmp_path / "identify").mkdir()
-    (tmp_path / "identify" / "fit.json").touch()
-    assert not all_stages._idle_core(asked) and all_stages._idle_core(replace(asked, again=True))
-    assert not all_stages._idle_core(replace(asked, again=True, scene=tmp_path / "own.xml"))
-    monkeypatch.setattr("droid_jax.runtime.cores", lambda: 1)
-    assert not all_stages._idle_core(replace(asked, again=True))
-
-
 def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: Path, capsys):
     assert main([]) == 0
     fit, search, policy, trials = called
@@ -130,7 +102,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
     assert known_robot(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
-    stages = {"record": 9, "identify": 9, "gap": 6, "train": 3, "evaluate": 1}
+    stages = {"record": 9, "identify": 9, "gap": 7, "train": 3, "evaluate": 1}
     assert [line for line in lines if line.startswith("[")] == [
         f"[{k}/5] {stage}{said}"
         for k, (stage, left) in enumerate(stages.items(), 1)

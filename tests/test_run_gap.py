@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import subprocess
@@ -14,7 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from small_gap import EFFECTS, FLOOR, JOINTS, PRELOAD, QUICK, SCENE, record, small, small_scene, write_parameters
@@ -421,38 +419,6 @@ def test_the_base_fit_begins_at_an_earlier_fit(place: Path, quick: None, monkeyp
     assert start[space.index(first)] == base[first].high
     for p in base.parameters:
         assert p.name == first or start[space.index(p.name)] == pytest.approx(known.get(p.name, p.mean))
-
-
-def test_a_prepared_case_is_searched_without_another_compilation(place: Path, monkeypatch: pytest.MonkeyPatch):
-    """`all` prepares it while it fits; the search gets this case, whose programs exist."""
-    monkeypatch.setattr(gap, "gap_config", lambda command: QUICK)
-    files = (place / "train.npz", place / "validation.npz")
-    command = gap.GapCommand(
-        files, scene=SCENE, parameters=place / "parameters.json", object_joint="door", joint_friction="scene",
-        effects=EFFECTS, out=place / "run",
-    )  # fmt: skip
-    case, compiled = gap.prepared(command), list[str]()
-
-    def search(split, known, fine, start, progress):
-        assert known.full_space is case.full_space
-        with jax.log_compiles():
-            known.train.whitened(known.full_space.mean[None])
-            fine.whitened(known.base.mean[None])
-        raise KeyboardInterrupt
-
-    class Compilations(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            compiled.append(record.getMessage())
-
-    monkeypatch.setattr(missing, "search", search)
-    handler = Compilations()
-    logging.getLogger("jax").addHandler(handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            gap.run(command, known=lambda: case)
-    finally:
-        logging.getLogger("jax").removeHandler(handler)
-    assert not [text for text in compiled if "block" in text], compiled
 
 
 def test_a_fit_that_is_none_or_of_another_model(place: Path, quick: None, refused):

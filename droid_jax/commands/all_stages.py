@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import time
 import typing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 from droid_jax import distributed
 from droid_jax.commands import evaluate, gap, identify, report, train
@@ -31,10 +29,6 @@ from droid_jax.files import ASKED, FIT, GAP, LAST_FILES, TRANSFER
 from droid_jax.report.stages import left_over, setup, unfinished
 from droid_jax.storage import write_json
 
-if TYPE_CHECKING:
-    from droid_jax.discrepancy.case import Case
-
-T = TypeVar("T")
 Stage = Literal["identify", "gap", "train", "evaluate"]
 STAGES: tuple[Stage, ...] = typing.get_args(Stage)
 IN_A_SCENE: tuple[Stage, ...] = ("identify", "gap")  # stages for your own scene; policies need the built-in door
@@ -53,7 +47,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.4, "identify": 2.6, "gap": 2.7, "train": 2.3, "evaluate": 1.1}
+MINUTES = {"record": 0.4, "identify": 1.7, "gap": 4.0, "train": 2.3, "evaluate": 1.1}
 """Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
@@ -66,7 +60,7 @@ class All:
     """
 
     preset: Literal["quick", "paper", "gpu"] = "quick"
-    """quick: preset quick in identify, gap and train; ten minutes on two fast cores.  paper: standard in identify and gap
+    """quick: preset quick in identify, gap and train; ten minutes on two cores.  paper: standard in identify and gap
     (100 generations; no policy can be trained with the servo of identify's preset paper), paper in train; hours.  gpu:
     gpu in all stages."""
     recording: tuple[Path, ...] = ()
@@ -317,24 +311,19 @@ def _plan(
     # Test data are not fitted.
     seen = tuple(path for path, role in zip(recordings, roles, strict=False) if role != "test")
 
-    known: Callable[[], Case] | None = None  # the case of the search, whose programs compile during the fit
-
-    def searching(fit: Path | None) -> gap.GapCommand:
-        scale = command.effect_scale
-        return gap.GapCommand(
-            recordings, fit=fit, preset=presets.identify, effect_scale=scale, out=out / "gap", **board, **own
-        )
-
     def fit() -> None:
-        nonlocal known
-        if "gap" in command.stages and "validation" in roles and _idle_core(command):
-            known = _meanwhile(functools.partial(gap.prepared, searching(None)))
         _stage(identify.run, identify.Identify(presets.identify, seen, out=out / "identify", **board, **own))
 
     def search() -> None:
         # A log that is split into blocks has no validation recording, and its base fit needs no start.
         fit = out / "identify" if "validation" in roles and _fitted(out / "identify", command, recordings) else None
-        _stage(gap.run if known is None else functools.partial(gap.run, known=known), searching(fit))
+        scale = command.effect_scale
+        _stage(
+            gap.run,
+            gap.GapCommand(
+                recordings, fit=fit, preset=presets.identify, effect_scale=scale, out=out / "gap", **board, **own
+            ),
+        )
 
     def learn() -> None:
         _stage(train.run, train.Train(model_folder(out), preset=presets.train, out=out / "train", **board, **common))
@@ -344,25 +333,6 @@ def _plan(
 
     plan = {"identify": fit, "gap": search, "train": learn, "evaluate": judge}
     return {stage: plan[stage] for stage in command.stages}
-
-
-def _idle_core(command: All) -> bool:
-    """Whether the programs of a search at the built-in door are better compiled during its fit, which leaves a core."""
-    import jax
-
-    from droid_jax import runtime
-
-    done = any((command.out / file).is_file() for file in (f"identify/{FIT}", f"gap/{GAP}"))
-    alone = distributed.count() == 1 and jax.default_backend() == "cpu" and runtime.cores() > 1
-    return command.scene is None and alone and (command.again or not done)
-
-
-def _meanwhile(make: Callable[[], T]) -> Callable[[], T]:
-    """Begin to make something in a thread; returns a function that waits for it.  A signal ends the program anyway."""
-    pool = ThreadPoolExecutor(1)
-    made = pool.submit(make)
-    pool.shutdown(wait=False)
-    return made.result
 
 
 def _fitted(folder: Path, command: All, recordings: Sequence[Path]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -122,28 +122,9 @@ class GapCommand:
     """Start over, even if the folder holds a finished or interrupted run."""
 
 
-def prepared(command: GapCommand) -> Case:
-    """The case of recordings with repeats, whose programs are compiled; for `run`, while something else is computed."""
-    from droid_jax.discrepancy.log_case import case_of
-    from droid_jax.discrepancy.step_error import with_finer_step
-    from droid_jax.preflight.search_inputs import assigned_roles
-
-    scene, base = gap_model(command)
-    given = given_to(command)
-    split, roles = assigned_roles(scene, given)
-    case = case_of(split, scene, base, chosen_effects(command, scene, given), roles, gap_config(command))
-    fine = with_finer_step(case.train, case.base, roles["train"])
-    if fine is not None:
-        fine.whitened(base.mean[None])
-    return case
-
-
 @writes("gap")
-def run(command: GapCommand, known: Callable[[], Case] | None = None) -> None:
-    """Record or load, fit, search, and write the run's folder and its page.
-
-    known: gives the case of the given recordings with repeats (`prepared`), if it was made already.
-    """
+def run(command: GapCommand) -> None:
+    """Record or load, fit, search, and write the run's folder and its page."""
     from droid_jax import runtime
     from droid_jax.report.progress import FOLDER, needs_writer, stages
 
@@ -179,7 +160,7 @@ def run(command: GapCommand, known: Callable[[], Case] | None = None) -> None:
     if finished(out, setup, command.again, GAP):
         _done(out)
         return
-    keeps = not command.again and to_be_amended(out)  # the verdict exists and stays
+    known = not command.again and to_be_amended(out)  # the verdict exists and stays
     if not command.force:
         refuse_certain(scene, given)
     split, roles = assigned_roles(scene, fitted, judges) if given else (Split.RECORDINGS, {})
@@ -193,12 +174,9 @@ def run(command: GapCommand, known: Callable[[], Case] | None = None) -> None:
     print(f"compiling the replay{then} ...", flush=True)
     began = time.monotonic()
     with stages(("first_fits",) if then else ()) as show:
-        if known is None:
-            case = case_of(split, scene, base, effects, roles, config, start, lambda now: show("first_fits", now))
-        else:
-            case = known()
+        case = case_of(split, scene, base, effects, roles, config, start, lambda now: show("first_fits", now))
     preparation = time.monotonic() - began
-    begin(out, setup, command.again, "gap", keep=keeps)  # only now that all inputs are valid
+    begin(out, setup, command.again, "gap", keep=known)  # only now that all inputs are valid
     board = out / FOLDER if command.tensorboard else None
     synthetic_robot = all(is_synthetic(r) for r in roles.values())
     robot = known_robot(command.recording or kept_at(out)) if synthetic_robot else {}

@@ -20,8 +20,8 @@ from droid_jax.commands.pictures import draw_replay
 from droid_jax.console import at_the_end
 from droid_jax.files import LAST_FILES
 
-Drawing = dict[Path, "subprocess.Popen[str]"]  # folder -> the process that draws its page
-_MEANWHILE: ContextVar[Drawing | None] = ContextVar("processes that draw", default=None)
+PageProcesses = dict[Path, "subprocess.Popen[str]"]  # folder -> the process that draws its page
+_MEANWHILE: ContextVar[PageProcesses | None] = ContextVar("processes that draw", default=None)
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ def run(command: Report) -> None:
 @contextlib.contextmanager
 def drawn_meanwhile() -> Iterator[None]:
     """Pages are drawn by processes of their own, for which this context waits; a signal ends them too."""
-    drawing = Drawing()
+    drawing = PageProcesses()
 
     def end() -> None:
-        for process in drawing.values():
+        for process in list(drawing.values()):
             process.terminate()
 
     token = _MEANWHILE.set(drawing)
@@ -75,7 +75,7 @@ def wait_for_pages() -> None:
         _finish(drawing, folder)
 
 
-def _finish(drawing: Drawing, folder: Path) -> None:
+def _finish(drawing: PageProcesses, folder: Path) -> None:
     """Wait for the process that draws a folder's page, if there is one."""
     if (process := drawing.get(folder)) is None:
         return

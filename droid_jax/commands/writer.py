@@ -12,7 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from droid_jax import console
 from droid_jax.files import ASKED, CONFIG, FIT, GAP, LOCK, SETUP, SYNTHETIC_ROBOT, SYNTHETIC_SOURCE, TRAINING, WRITTEN
@@ -20,6 +20,7 @@ from droid_jax.read_json import read_json
 from droid_jax.storage import kind_of
 
 _HELD = set[Path]()  # folders whose lock this process holds
+T = TypeVar("T")
 
 
 class InUse(ValueError):
@@ -38,12 +39,12 @@ def writes(
         make: whether to make a missing folder.
     """
 
-    def of(run: Callable[..., None]) -> Callable[..., None]:
+    def of(run: Callable[[T], None]) -> Callable[[T], None]:
         @functools.wraps(run)
-        def alone(command: Any, **more: Any) -> None:
+        def alone(command: T) -> None:
             at = folder(command)
             with one_writer(at, stage) if make or at.is_dir() else contextlib.nullcontext():
-                run(command, **more)
+                run(command)
 
         return alone
 

@@ -29,6 +29,7 @@ jax.tree_util.register_dataclass(  # not where it is defined: control.py needs n
 )
 
 ROWS = 64  # of a device: numbers of episodes up to its multiples share a program
+TRIALS = 2**31 - 1  # stream of a seed; a training with the same seed selects its policy on the first streams
 
 
 def simulated(policy: Policy, env: Environment, randomise: Randomise | None, episodes: int, seed: int = 0) -> Trials:
@@ -49,7 +50,7 @@ def simulated(policy: Policy, env: Environment, randomise: Randomise | None, epi
     """
     if other := differing(policy.interface, env.interface):
         raise ValueError(f"the policy was trained for another robot, door or task: {', '.join(other)} differ")
-    start, physics = jax.random.split(jax.random.key(seed))
+    start, physics = jax.random.split(jax.random.fold_in(jax.random.key(seed), TRIALS))
     return batch_of_episodes(env, randomise, episodes, physics)(policy, start).trials
 
 

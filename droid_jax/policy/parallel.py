@@ -48,9 +48,7 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
 class Staggered(EpisodeWrapper):
     """Episodes whose first ones are of random lengths, so that a batch holds all phases of an episode.
 
-    Environments that begin together stay in step: every batch would show the same few actions of all episodes.  On the
-    default command's door success then held after 2.4, 1.4, 1.9 and more than 2.5 million actions (seeds 0 to 3), and
-    with random phases after 1.5, 2.0, 1.5 and 0.9 million.
+    Environments that begin together stay in step: every batch would show the same few actions of all episodes.
     """
 
     def reset(self, rng: jax.Array) -> State:

@@ -288,7 +288,7 @@ def _content(title: str, make: Callable[..., Figure], args: tuple[Any, ...]) -> 
         pickler.fast = True  # else equal data would differ by which of their parts are one object
         try:
             pickler.dump((title, make, args))
-        except (pickle.PicklingError, AttributeError, TypeError, ValueError):
+        except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError):
             return None
         return hashlib.sha256(_sources() + buffer.getvalue()).hexdigest()
 

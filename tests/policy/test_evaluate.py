@@ -19,7 +19,7 @@ from droid_jax.door.space import door_space
 from droid_jax.door.task import Task
 from droid_jax.identify.gaussian import prior
 from droid_jax.policy.control import SHAPES, Interface, Policy
-from droid_jax.policy.evaluate import batch_of_episodes, simulated
+from droid_jax.policy.evaluate import TRIALS, batch_of_episodes, simulated
 from droid_jax.policy.randomise import randomised
 
 
@@ -68,7 +68,7 @@ def test_outcomes_do_not_depend_on_the_devices(monkeypatch: pytest.MonkeyPatch, 
     env: Any = Opening()
     assert len(jax.local_devices()) > 1
     many = simulated(network(0.5), env, draws, episodes)
-    physics = jax.random.split(jax.random.key(0))[1]
+    physics = jax.random.split(jax.random.fold_in(jax.random.key(0), TRIALS))[1]
     played = batch_of_episodes(env, draws, episodes, physics)(network(0.5), jax.random.key(1))
     assert played.reward == pytest.approx(2 * many.angle.mean())  # of two steps
     monkeypatch.setattr(runtime, "devices_mesh", lambda: jax.sharding.Mesh(np.array(jax.local_devices()[:1]), ("a",)))
@@ -99,6 +99,22 @@ def test_another_policy_on_other_doors_is_the_same_program(monkeypatch: pytest.M
     assert len(np.unique(np.round(widths, 5))) == 6 and np.min(widths) > 0 and np.max(widths) < 1
     alone = simulated(network(0.5), env, None, 2)
     np.testing.assert_allclose(alone.angle, 1.0 + np.tanh(0.5), rtol=1e-6)
+
+
+def test_a_policy_is_not_judged_on_the_doors_on_which_it_was_selected(monkeypatch: pytest.MonkeyPatch):
+    """With partitionable keys the parts of a split key are those of `fold_in`, from which a training draws."""
+    used = list[np.ndarray]()
+
+    def batch(env, randomise, episodes, physics):
+        used.append(np.asarray(jax.random.key_data(physics)))
+        return lambda policy, start: used.append(np.asarray(jax.random.key_data(start))) or SimpleNamespace(trials=None)
+
+    monkeypatch.setattr("droid_jax.policy.evaluate.batch_of_episodes", batch)
+    monkeypatch.setattr("droid_jax.policy.evaluate.differing", lambda one, other: [])
+    any_of: Any = SimpleNamespace(interface=None)
+    simulated(any_of, any_of, None, 3, seed=4)
+    training = [np.asarray(jax.random.key_data(jax.random.fold_in(jax.random.key(4), k))) for k in range(100)]
+    assert len(used) == 2 and not any(np.array_equal(one, other) for one in used for other in training)
 
 
 def test_a_policy_of_another_robot_is_refused():
