@@ -102,7 +102,7 @@ def test_without_arguments_every_stage_runs_on_one_recording(called, tmp_path: P
     assert policy.fit == fit.out and policy.out == trials.run == Path("runs/all/train")
     assert known_robot(files) == {"springs": 1, "seed": 0, "hide": ["magnetic_catch=1.5"]}
     lines = capsys.readouterr().out.splitlines()
-    stages = {"record": 9, "identify": 9, "gap": 7, "train": 3, "evaluate": 1}
+    stages = {"record": 9, "identify": 9, "gap": 6, "train": 3, "evaluate": 1}
     assert [line for line in lines if line.startswith("[")] == [
         f"[{k}/5] {stage}{said}"
         for k, (stage, left) in enumerate(stages.items(), 1)

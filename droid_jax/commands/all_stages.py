@@ -47,7 +47,7 @@ PRESETS = {
     "gpu": _Presets("gpu", "gpu"),
 }
 
-MINUTES = {"record": 0.4, "identify": 1.7, "gap": 4.0, "train": 2.3, "evaluate": 1.1}
+MINUTES = {"record": 0.4, "identify": 2.6, "gap": 2.7, "train": 2.3, "evaluate": 1.1}
 """Duration of each stage with the preset "quick", on two cores with an empty cache (benchmarks/default_run.py)."""
 
 
