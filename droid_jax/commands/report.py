@@ -66,6 +66,8 @@ def drawn_meanwhile() -> Iterator[None]:
     finally:
         _MEANWHILE.reset(token)
         end()
+        for process in drawing.values():
+            process.wait()
 
 
 def wait_for_pages() -> None:

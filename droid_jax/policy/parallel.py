@@ -35,12 +35,12 @@ def wrapped(randomise: Randomise | None, devices: int, seed: int) -> Callable[..
         if next(uses):
             return Unused(env)
         if randomise is None:
-            return AutoResetWrapper(Staggered(VmapWrapper(env), episode_length, action_repeat))
-        count = len(randomization_fn.keywords["rng"])  # of environments on one device
-        drawn = RandomisedEnvs(
-            env, randomise, count, devices, jax.random.fold_in(jax.random.PRNGKey(seed), 0)
-        )  # 1: evaluations
-        return AutoResetWrapper(Staggered(drawn, episode_length, action_repeat))
+            many: Env = VmapWrapper(env)
+        else:
+            count = len(randomization_fn.keywords["rng"])  # of environments on one device
+            physics = jax.random.fold_in(jax.random.PRNGKey(seed), 0)  # evaluations draw from 1
+            many = RandomisedEnvs(env, randomise, count, devices, physics)
+        return AutoResetWrapper(Staggered(many, episode_length, action_repeat))
 
     return wrap_env
 
